@@ -1,0 +1,261 @@
+"""The command line ``cvo-edge``: argument parsing and exit codes only."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from enum import StrEnum
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, NoReturn
+
+# numpy's thread pool would double the memory of a process that does no linear algebra in it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import typer
+
+from cvo_edge.errors import CvoError, GateError, SinkError, SourceError
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Pose intervals from camera images: a 6-DoF pose per frame and, for each degree of "
+    "freedom, an interval that holds the truth with a stated probability.",
+)
+
+
+class ScopeName(StrEnum):
+    """For each degree of freedom, or for all six at once."""
+
+    MARGINAL = "marginal"
+    JOINT = "joint"
+
+
+class FormatName(StrEnum):
+    """Output formats."""
+
+    JSONL = "jsonl"
+    CSV = "csv"
+    TUM = "tum"
+
+
+BundleArgument = Annotated[
+    Path, typer.Argument(help="Folder with model.onnx and calibration.json.", show_default=False)
+]
+ThreadsOption = Annotated[
+    int | None, typer.Option(help="Threads of one inference; all allowed cores by default.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+@app.command()
+def run(
+    bundle: BundleArgument,
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Folder of images, glob, video file, camera index or device.", show_default=False
+        ),
+    ],
+    output: Annotated[str, typer.Option("-o", "--output", help="File, or - for stdout.")] = "-",
+    format: Annotated[FormatName, typer.Option(help="Output format.")] = FormatName.JSONL,
+    confidence: Annotated[float, typer.Option(help="One of those stored in the bundle.")] = 0.9,
+    scope: Annotated[
+        ScopeName, typer.Option(help="Each degree of freedom, or all six at once.")
+    ] = ScopeName.MARGINAL,
+    threads: ThreadsOption = None,
+    max_frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Stamp frames at this rate from zero.")] = None,
+    ground_truth: Annotated[
+        Path | None,
+        typer.Option(help="TUM file or folder of .pose.txt; the summary then shows coverage."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No summary on stderr.")] = False,
+) -> None:
+    """Estimate a pose interval for every frame of a source."""
+    from cvo_edge.odometer import Odometer
+    from cvo_edge.run import RunSummary
+    from cvo_edge.run import run as run_frames
+    from cvo_edge.sinks import Sink
+    from cvo_edge.sources import open_source
+    from cvo_edge.trajectory import open_ground_truth
+
+    truth = open_ground_truth(ground_truth) if ground_truth else None
+    with Odometer.load(
+        bundle, threads=threads, confidence=confidence, scope=scope.value
+    ) as odometer:
+        frames = open_source(source, fps)
+        summary = RunSummary(odometer.chart.dof, confidence, scope)
+        with Sink(output, format.value) as sink:
+            try:
+                run_frames(
+                    odometer,
+                    frames,
+                    sink.write,
+                    summary=summary,
+                    truth=truth,
+                    max_frames=max_frames,
+                )
+            finally:
+                if not quiet and summary.frames:
+                    print(*summary.lines(), sep="\n", file=sys.stderr)
+    if summary.statuses["invalid"] == summary.frames:
+        raise SourceError(
+            f"{source}: expected at least one valid frame, found none in {summary.frames}"
+        )
+
+
+@app.command()
+def bench(
+    bundle: BundleArgument,
+    source: Annotated[
+        str | None, typer.Argument(help="As for run; a still 640x480 image by default.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 200,
+    warmup: Annotated[int, typer.Option(min=0, help="Frames before those.")] = 20,
+    threads: ThreadsOption = None,
+    json_file: Annotated[
+        str | None, typer.Option("--json", help="Write the report as JSON to a file or -.")
+    ] = None,
+    max_p95_ms: Annotated[
+        float | None, typer.Option(help="Exit 8 where the total's p95 is longer.")
+    ] = None,
+    max_rss_mib: Annotated[
+        float | None, typer.Option(help="Exit 8 where peak memory is larger.")
+    ] = None,
+) -> None:
+    """Measure latency, memory and processor time, beside the bare model call."""
+    from cvo_edge.benchmark import benchmark, benchmark_lines
+
+    report = benchmark(bundle, source, frames=frames, warmup=warmup, threads=threads)
+    if json_file is not None:
+        write_text(json_file, json.dumps(report, indent=1) + "\n")
+    if json_file != "-":
+        print(*benchmark_lines(report), sep="\n")
+    p95, rss = report["latency_ms"]["total"]["p95"], report["memory_mib"]["peak_rss"]
+    if max_p95_ms is not None and not p95 <= max_p95_ms:
+        raise GateError(f"bench: expected p95 of at most {max_p95_ms:g} ms, found {p95:.3f} ms")
+    if max_rss_mib is not None and not rss <= max_rss_mib:
+        raise GateError(f"bench: expected peak memory of at most {max_rss_mib:g} MiB, found {rss}")
+
+
+@app.command()
+def verify(bundle: BundleArgument, threads: ThreadsOption = None) -> None:
+    """Check every digest of a bundle, load it and run its self-test on this machine."""
+    from cvo_edge.artifact import read_bundle
+    from cvo_edge.odometer import Odometer
+    from cvo_edge.selftest import check_selftest
+
+    content = read_bundle(bundle)
+    first = content.calibration.thresholds[0]
+    with Odometer(
+        content, threads=threads, confidence=first.confidence, scope=first.scope
+    ) as odometer:
+        worst = check_selftest(odometer)
+    tolerance = content.calibration.selftest.tolerance
+    print(
+        f"{content.calibration.name}: digests match, model loads, self-test passed "
+        f"(largest difference {worst:.2g}, tolerance {tolerance:g})"
+    )
+
+
+@app.command()
+def inspect(bundle: BundleArgument, as_json: JsonOption = False) -> None:
+    """Show what a bundle is: method, model, thresholds, where they come from."""
+    import msgspec
+
+    from cvo_edge.artifact import read_calibration
+    from cvo_edge.describe import inspect_lines
+
+    calibration = read_calibration(bundle)
+    if as_json:
+        print(json.dumps(msgspec.to_builtins(calibration), indent=1))
+    else:
+        print(*inspect_lines(calibration), sep="\n")
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of calibration.json."""
+    from cvo_edge.describe import calibration_schema
+
+    print(json.dumps(calibration_schema(), indent=1))
+
+
+@app.command()
+def doctor(as_json: JsonOption = False) -> None:
+    """Show what this machine offers: processor, cores, versions, memory."""
+    from cvo_edge.describe import doctor_lines
+    from cvo_edge.profile import environment, memory_mib
+
+    report = {**environment(), "memory_mib": memory_mib()}
+    if as_json:
+        print(json.dumps(report, indent=1))
+    else:
+        print(*doctor_lines(report), sep="\n")
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"cvo-edge {version('cvo-edge')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+    ] = False,
+) -> None:
+    """Options that need no command."""
+
+
+def write_text(target: str, text: str) -> None:
+    """Write text to a file, or to standard output for ``-``; raises SinkError."""
+    if target == "-":
+        sys.stdout.write(text)
+        return
+    try:
+        Path(target).write_text(text, "utf-8")
+    except OSError as error:
+        raise SinkError(f"{target}: cannot be written: {error.strerror}") from None
+
+
+def guarded(program: str, command: typer.Typer) -> NoReturn:
+    """Run a command line and leave with the documented exit code.
+
+    One line on stderr for every error from outside; a reader of stdout that has left ends it
+    quietly; SIGINT and SIGTERM unwind, so that sinks are flushed and closed. Both programs go
+    through here.
+    """
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        code = command(args=sys.argv[1:] or ["--help"], standalone_mode=False) or 0
+        sys.stdout.flush()
+    except CvoError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        code = error.exit_code
+    except typer.TyperException as error:
+        print(f"{program}: {error.format_message().strip()}", file=sys.stderr)
+        code = error.exit_code
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    sys.exit(code)
+
+
+def _terminate(number: int, _: FrameType | None) -> NoReturn:
+    raise SystemExit(128 + number)
+
+
+def main() -> NoReturn:
+    """Entry point of ``cvo-edge``."""
+    guarded("cvo-edge", app)

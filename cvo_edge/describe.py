@@ -1,0 +1,67 @@
+"""What a person asks of a bundle or a machine, as lines of text, and the JSON Schema."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from cvo_edge.artifact import Calibration
+from cvo_edge.heads import HEADS
+from cvo_edge.pose import Chart
+
+
+def inspect_lines(calibration: Calibration) -> list[str]:
+    """Return a bundle's description for a person."""
+    model, source = calibration.model, calibration.calibration
+    pose = calibration.pose
+    tensors = ", ".join(f"{t.name} {list(t.shape)}" for t in (*model.inputs, *model.outputs))
+    dof = Chart(pose.rotation).dof
+    lines = [
+        f"name         {calibration.name}",
+        f"method       {calibration.method}, {source.score} score",
+        f"model        {model.precision}, opset {model.opset}, sha256 {model.sha256[:16]}...",
+        f"tensors      {tensors}",
+        f"pose         {pose.target}, {pose.child_frame_id} in {pose.frame_id}, {pose.rotation}",
+        f"calibrated   on {source.n} frames of {source.n_sequences} sequence(s) of "
+        f"{source.dataset}, split {source.split.kind} (seed {source.split.seed}), {source.rule}; "
+        f"worth about {source.n_effective:.0f} independent frames",
+        f"backbone     {calibration.provenance.backbone}",
+        "",
+        f"{'q_hat at':<16}" + "".join(f"{name:>11}" for name in dof),
+    ]
+    for entry in calibration.thresholds:
+        sides = [("", entry.q_hat)]
+        if entry.q_hat_upper is not None:
+            sides = [(" low", entry.q_hat), (" high", entry.q_hat_upper)]
+        for side, values in sides:
+            cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>11}" for v in values)
+            lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<16}" + cells)
+    return lines
+
+
+def doctor_lines(report: dict[str, Any]) -> list[str]:
+    """Return the environment for a person."""
+    versions = ", ".join(f"{name} {value}" for name, value in report["versions"].items())
+    return [
+        f"processor    {report['cpu']} ({report['architecture']})",
+        f"cores        {report['cores_allowed']} allowed of {report['cores_present']} present",
+        f"governor     {report['governor'] or 'not readable'}",
+        f"system       {report['system']}",
+        f"load         {' '.join(f'{value:.2f}' for value in report['load_average'])}",
+        f"versions     {versions}",
+    ]
+
+
+def calibration_schema() -> dict[str, Any]:
+    """Return the JSON Schema of ``calibration.json``, with each method's own parameters."""
+    parameters = [head.parameters_type for head in HEADS.values()]
+    (document, *own), components = msgspec.json.schema_components(
+        [Calibration, *parameters], ref_template="#/$defs/{name}"
+    )
+    components["Calibration"]["properties"]["method_parameters"] = {"anyOf": own}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **document,
+        "$defs": components,
+    }

@@ -1,0 +1,45 @@
+"""One conformal method a file: its nonconformity score and the inverse, from threshold to set.
+
+``HEADS`` is the registry: a new method is one file here, one of the same name on the training
+side, and one line in each registry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from cvo_edge.artifact import Calibration, Threshold
+from cvo_edge.heads.cjp import CjpHead
+from cvo_edge.pose import ConformalSet
+
+Array = NDArray[np.float64]
+
+
+class Head(Protocol):
+    """What every method provides to the odometer and to calibration."""
+
+    parameters_type: ClassVar[type[Struct]]
+
+    def __init__(self, calibration: Calibration) -> None:
+        """Read the method's parameters; raises CalibrationFileError where they are not its own."""
+
+    def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
+        """Model inputs besides the image for frame number ``seq``."""
+
+    def scores(self, outputs: Mapping[str, NDArray[Any]], point: Array, truth: Array) -> Array:
+        """Nonconformity (n, 6) of outputs stacked over n frames; point and truth (n, 6)."""
+
+    def region(
+        self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
+    ) -> ConformalSet:
+        """The set {y : score(y) <= q_hat} of one frame; point (6,)."""
+
+
+HEADS: dict[str, type[Head]] = {
+    "cjp": CjpHead,
+}

@@ -1,0 +1,253 @@
+"""The loop: camera image -> model input -> named outputs -> conformal set -> PoseInterval."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cvo_edge import geometry, preprocess
+from cvo_edge.artifact import Bundle, Threshold, read_bundle
+from cvo_edge.errors import CalibrationFileError, UsageError
+from cvo_edge.heads import HEADS
+from cvo_edge.pose import (
+    Chart,
+    ConformalSet,
+    Pose,
+    PoseInterval,
+    Reason,
+    Scope,
+    Status,
+    unbounded_set,
+)
+from cvo_edge.session import Session
+from cvo_edge.sources import Frame
+
+Array = NDArray[np.float64]
+
+_STEEP_PITCH = np.deg2rad(80.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What the network says of one image, before any threshold.
+
+    ``outputs`` by name, each with a leading axis of one; ``pose`` (7,) with a unit quaternion and
+    ``point`` (6,), the same pose in the bundle's chart. Where ``fault`` is set none may be used.
+    """
+
+    outputs: dict[str, NDArray[np.float32]]
+    pose: Array
+    point: Array
+    fault: Reason | None = None
+    preprocess_ms: float = 0.0
+    model_ms: float = 0.0
+
+
+class Odometer:
+    """Pose intervals from camera images, by one bundle.
+
+    One instance serves one stream: it numbers the frames. Use it as a context manager, or call
+    ``close``.
+
+    Parameters
+    ----------
+    bundle
+        A bundle as ``read_bundle`` returns it.
+    threads
+        Threads of one inference; all allowed cores by default.
+    confidence
+        One of the confidences stored in the bundle.
+    scope
+        ``marginal``: the confidence holds for each degree of freedom; ``joint``: for all six at
+        once.
+
+    Raises
+    ------
+    UsageError
+        A confidence that is not stored; the message lists those that are.
+    CalibrationFileError, ModelError, BundleMismatchError
+        The bundle is not what it has to be.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        *,
+        threads: int | None = None,
+        confidence: float = 0.9,
+        scope: Scope = "marginal",
+    ) -> None:
+        calibration = bundle.calibration
+        if calibration.method not in HEADS:
+            raise CalibrationFileError(
+                f"method: expected one of {', '.join(HEADS)}, found {calibration.method}"
+            )
+        self.calibration = calibration
+        self.confidence = confidence
+        self.scope = scope
+        self.threshold = self._stored_threshold(confidence, scope)
+        self.head = HEADS[calibration.method](calibration)
+        self.session: Session | None = Session(bundle.model_bytes, threads, calibration.model)
+        reference = calibration.pose.reference_q_xyzw
+        self.chart = Chart(
+            calibration.pose.rotation, None if reference is None else np.array(reference)
+        )
+        self._lowest = np.array(calibration.pose.limits.lowest)
+        self._highest = np.array(calibration.pose.limits.highest)
+        self._seq = 0
+
+    @classmethod
+    def load(
+        cls,
+        bundle: str | Path,
+        *,
+        threads: int | None = None,
+        confidence: float = 0.9,
+        scope: Scope = "marginal",
+    ) -> Odometer:
+        """Read the bundle folder and be ready to step; parameters and errors as the class's."""
+        content = read_bundle(Path(bundle))
+        return cls(content, threads=threads, confidence=confidence, scope=scope)
+
+    def __enter__(self) -> Odometer:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close it."""
+        self.close()
+
+    def close(self) -> None:
+        """Give back the model's memory; closing twice is harmless, stepping afterwards an error."""
+        self.session = None
+
+    def step(
+        self,
+        image_bgr: ArrayLike | None,
+        stamp_ns: int | None = None,
+        source: str = "",
+        read_ms: float = 0.0,
+    ) -> PoseInterval:
+        """Estimate the pose of one image and the set that holds it.
+
+        Parameters
+        ----------
+        image_bgr
+            Shape (height, width, 3), uint8, BGR as OpenCV reads it; grey, alpha and 16 bits are
+            converted. None, or what is no image, gives an ``invalid`` estimate.
+        stamp_ns
+            Time of the image in integer nanoseconds, carried through.
+        source
+            Name of the image, carried through.
+        read_ms
+            What reading it took, for the record's latencies.
+
+        Raises
+        ------
+        UsageError
+            After ``close``.
+        ModelError
+            onnxruntime failed.
+        """
+        start = perf_counter()
+        seq = self._seq
+        self._seq += 1
+        observation = self.observe(image_bgr, seq)
+        concluded = perf_counter()
+        fault = observation.fault
+        region = unbounded_set() if fault else self.region(observation)
+        reasons = (fault,) if fault else self._remarks(observation, region)
+        end = perf_counter()
+        return PoseInterval(
+            seq=seq,
+            stamp_ns=stamp_ns,
+            source=source,
+            status=Status.INVALID if fault else Status.OK,
+            reasons=reasons,
+            pose=None if fault else Pose(observation.pose[:3], observation.pose[3:]),
+            region=region,
+            confidence=self.confidence,
+            scope=self.scope,
+            chart=self.chart,
+            latency_ms={
+                "read": round(read_ms, 4),
+                "preprocess": round(observation.preprocess_ms, 4),
+                "model": round(observation.model_ms, 4),
+                "conformal": round(1e3 * (end - concluded), 4),
+                "total": round(read_ms + 1e3 * (end - start), 4),
+            },
+        )
+
+    def stream(self, frames: Iterable[Frame | NDArray[Any]]) -> Iterator[PoseInterval]:
+        """Step through frames of a source, or through bare BGR images, lazily."""
+        for frame in frames:
+            if isinstance(frame, Frame):
+                yield self.step(frame.image, frame.stamp_ns, frame.source, frame.read_ms)
+            else:
+                yield self.step(frame)
+
+    def observe(self, image_bgr: ArrayLike | None, seq: int) -> Observation:
+        """Run the network on one image; the checks on image and outputs are in ``fault``."""
+        if self.session is None:
+            raise UsageError("Odometer: expected an open one, found it closed")
+        if image_bgr is None:
+            return _faulty(Reason.IMAGE_UNREADABLE)
+        start = perf_counter()
+        image = preprocess.to_bgr8(image_bgr)
+        if image is None:
+            return _faulty(Reason.IMAGE_UNSUPPORTED)
+        spec = self.calibration.preprocess
+        tensor = preprocess.model_input(image, spec.height, spec.width, spec.crop)
+        ready = perf_counter()
+        outputs = self.session.run({"image": tensor, **self.head.extra_inputs(seq)})
+        done = perf_counter()
+        pose = outputs["pose"][0].astype(np.float64)
+        fault: Reason | None = None
+        point = pose[:6]
+        if not all(np.isfinite(output).all() for output in outputs.values()):
+            fault = Reason.OUTPUT_NOT_FINITE
+        else:
+            pose[3:] = geometry.quaternion_normalise(pose[3:])
+            point = self.chart.coordinates(pose, pose)
+            # Written so that NaN (a zero quaternion) fails the check.
+            if not ((self._lowest <= point) & (point <= self._highest)).all():
+                fault = Reason.POSE_IMPLAUSIBLE
+        return Observation(outputs, pose, point, fault, 1e3 * (ready - start), 1e3 * (done - ready))
+
+    def region(self, observation: Observation, threshold: Threshold | None = None) -> ConformalSet:
+        """The conformal set of an observation, by default at the odometer's own threshold."""
+        return self.head.region(observation.outputs, observation.point, threshold or self.threshold)
+
+    def _stored_threshold(self, confidence: float, scope: Scope) -> Threshold:
+        threshold = self.calibration.threshold(confidence, scope)
+        if threshold is None:
+            stored = ", ".join(f"{value:g}" for value in self.calibration.confidences(scope))
+            raise UsageError(
+                f"confidence: expected one stored in the bundle for scope {scope} "
+                f"({stored or 'none'}), found {confidence:g}"
+            )
+        return threshold
+
+    def _remarks(self, observation: Observation, region: ConformalSet) -> tuple[Reason, ...]:
+        remarks: tuple[Reason, ...] = ()
+        if region.crossed:
+            remarks += (Reason.BOUNDS_CROSSED,)
+        if self.chart.rotation == "euler_zyx" and abs(observation.point[4]) > _STEEP_PITCH:
+            remarks += (Reason.PITCH_NEAR_90,)
+        return remarks
+
+
+def _faulty(reason: Reason) -> Observation:
+    return Observation({}, np.full(7, np.nan), np.full(6, np.nan), reason)

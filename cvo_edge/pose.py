@@ -1,0 +1,303 @@
+"""Poses, conformal sets and what the odometer returns for one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from statistics import NormalDist
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cvo_edge import geometry
+from cvo_edge.errors import UsageError
+
+Array = NDArray[np.float64]
+Scope = Literal["marginal", "joint"]
+Rotation = Literal["euler_zyx", "tangent_predicted", "tangent_reference"]
+Bands = tuple[tuple[tuple[float, float], ...], ...]
+
+_TRANSLATION = ("tx", "ty", "tz")
+
+
+class Status(StrEnum):
+    """What a frame's estimate is worth."""
+
+    OK = "ok"
+    DEGRADED = "degraded"
+    INVALID = "invalid"
+
+
+class Reason(StrEnum):
+    """The closed list of remarks on a frame; the comment says which status each one goes with."""
+
+    IMAGE_UNREADABLE = "image_unreadable"  # invalid: the file or stream gave no whole image
+    IMAGE_UNSUPPORTED = "image_unsupported"  # invalid: not a 2-D or 3-channel 8- or 16-bit image
+    OUTPUT_NOT_FINITE = "output_not_finite"  # invalid: the network gave NaN or infinity
+    POSE_IMPLAUSIBLE = "pose_implausible"  # invalid: outside the bundle's pose limits
+    BOUNDS_CROSSED = "bounds_crossed"  # ok: a negative correction emptied a set; its middle stands
+    PITCH_NEAR_90 = "pitch_near_90"  # ok: |pitch| > 80 deg, roll and yaw are ill-defined
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A camera pose ``T_world_camera``: ``p_world = R p_camera + t``.
+
+    Attributes
+    ----------
+    t_m
+        Shape (3,): tx ty tz, metres, the camera's centre in the world frame.
+    q_xyzw
+        Shape (4,): unit quaternion of the camera's rotation, qw >= 0.
+    """
+
+    t_m: Array
+    q_xyzw: Array
+
+    @classmethod
+    def from_array(cls, pose: ArrayLike) -> Pose:
+        """Shape (7,): tx ty tz qx qy qz qw -> Pose; raises UsageError where it is none."""
+        values = np.asarray(pose, dtype=np.float64)
+        if values.shape != (7,) or not np.isfinite(values).all() or not values[3:].any():
+            raise UsageError(
+                f"pose: expected 7 finite numbers tx ty tz qx qy qz qw, found {values.tolist()}"
+            )
+        return cls(values[:3].copy(), geometry.quaternion_normalise(values[3:]))
+
+    @classmethod
+    def from_matrix(cls, T_world_camera: ArrayLike) -> Pose:
+        """Shape (4, 4) homogeneous matrix -> Pose; the rotation part is made orthonormal."""
+        T = np.asarray(T_world_camera, dtype=np.float64)
+        if T.shape != (4, 4) or not np.isfinite(T).all():
+            raise UsageError(f"pose: expected a finite 4x4 matrix, found shape {T.shape}")
+        R = geometry.nearest_rotation(T[:3, :3])
+        return cls(T[:3, 3].copy(), geometry.matrix_to_quaternion(R))
+
+    def to_array(self) -> Array:
+        """Shape (7,): tx ty tz qx qy qz qw."""
+        return np.concatenate([self.t_m, self.q_xyzw])
+
+    def to_matrix(self) -> Array:
+        """Shape (4, 4): the homogeneous matrix ``T_world_camera``."""
+        T = np.eye(4)
+        T[:3, :3] = geometry.quaternion_to_matrix(self.q_xyzw)
+        T[:3, 3] = self.t_m
+        return T
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """How a pose becomes six numbers: tx ty tz in metres, then three rotation numbers in rad.
+
+    ``tangent_reference``: Log(R_reference^T R). ``tangent_predicted``: Log(R_predicted^T R), an
+    offset about the prediction. ``euler_zyx``: roll, pitch, yaw, each on the branch nearest to
+    the prediction's (so that an interval across +-pi stays one interval).
+    """
+
+    rotation: Rotation
+    reference_q_xyzw: Array | None = None
+
+    @property
+    def dof(self) -> tuple[str, str, str, str, str, str]:
+        """Names of the six degrees of freedom, in the order used everywhere."""
+        turns = ("roll", "pitch", "yaw") if self.rotation == "euler_zyx" else ("rx", "ry", "rz")
+        return (*_TRANSLATION, *turns)
+
+    def coordinates(self, pose: ArrayLike, predicted: ArrayLike) -> Array:
+        """Six numbers of poses (..., 7) as seen from predictions (..., 7) -> (..., 6)."""
+        p = np.asarray(pose, dtype=np.float64)
+        origin = np.asarray(predicted, dtype=np.float64)
+        if self.rotation == "euler_zyx":
+            at_origin = geometry.quaternion_to_euler_zyx(origin[..., 3:])
+            turn = geometry.quaternion_to_euler_zyx(p[..., 3:])
+            turn = at_origin + geometry.wrap_angle(turn - at_origin)
+        else:
+            q_base = self.reference_q_xyzw if self.reference_q_xyzw is not None else origin[..., 3:]
+            q_base_inverse = geometry.quaternion_conjugate(q_base)
+            turn = geometry.quaternion_log(geometry.quaternion_multiply(q_base_inverse, p[..., 3:]))
+        return np.concatenate(np.broadcast_arrays(p[..., :3], turn), axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class ConformalSet:
+    """The set that holds each degree of freedom with the stated confidence.
+
+    Attributes
+    ----------
+    lower, upper
+        Shape (6,): its hull in the bundle's chart, m and rad; infinite where unbounded.
+    bands
+        For methods whose sets may have gaps: per DoF the disjoint intervals (low, high) in
+        ascending order; None where the set is its hull.
+    crossed
+        Whether a correction emptied the set of some DoF, so that its middle stands for it.
+    """
+
+    lower: Array
+    upper: Array
+    bands: Bands | None = None
+    crossed: bool = False
+
+    def covers(self, coordinates: ArrayLike) -> NDArray[np.bool_]:
+        """Which of six coordinates (6,) lie in the set, shape (6,); gaps count as outside."""
+        y = np.asarray(coordinates, dtype=np.float64)
+        if self.bands is None:
+            return np.asarray((self.lower <= y) & (y <= self.upper))
+        return np.array(
+            [
+                any(low <= value <= high for low, high in bands)
+                for value, bands in zip(y.tolist(), self.bands, strict=True)
+            ]
+        )
+
+    def within(self, lowest: Array, highest: Array) -> ConformalSet:
+        """Return the set with its unbounded sides put at these limits, (6,) each."""
+        return ConformalSet(
+            np.where(np.isfinite(self.lower), self.lower, lowest),
+            np.where(np.isfinite(self.upper), self.upper, highest),
+            self.bands,
+            self.crossed,
+        )
+
+    def width(self) -> Array:
+        """Measure of the set per DoF, (6,): of the union of its bands, not of their hull."""
+        if self.bands is None:
+            return self.upper - self.lower
+        return np.array([sum(high - low for low, high in bands) for bands in self.bands])
+
+    def distance(self, coordinates: ArrayLike) -> Array:
+        """Distance of six coordinates (6,) to the nearest point of the set per DoF; 0 inside."""
+        y = np.asarray(coordinates, dtype=np.float64)
+        if self.bands is None:
+            return np.asarray(np.maximum(np.maximum(self.lower - y, y - self.upper), 0.0))
+        return np.array(
+            [
+                min(max(low - value, value - high, 0.0) for low, high in bands)
+                for value, bands in zip(y.tolist(), self.bands, strict=True)
+            ]
+        )
+
+
+_UNBOUNDED = ConformalSet(np.full(6, -np.inf), np.full(6, np.inf))
+_UNBOUNDED.lower.setflags(write=False)
+_UNBOUNDED.upper.setflags(write=False)
+
+
+def unbounded_set() -> ConformalSet:
+    """The set that holds everything: what is known where a check failed."""
+    return _UNBOUNDED
+
+
+@dataclass(frozen=True, eq=False)
+class PoseInterval:
+    """One frame's estimate: the pose and the set that holds the true pose.
+
+    Attributes
+    ----------
+    seq, stamp_ns, source
+        Number of the frame in its stream, time in integer nanoseconds (None where the source gives
+        none) and the source's name for it.
+    status, reasons
+        ``ok``; ``degraded`` (a pose, but nothing may be claimed: all bounds infinite); ``invalid``
+        (no pose either). Remarks from the closed list ``Reason``.
+    pose
+        The point estimate, None where invalid.
+    region
+        The conformal set; everything (infinite) unless the status is ``ok``.
+    confidence, scope
+        The stated probability, and whether it holds for each DoF (``marginal``) or for all six at
+        once (``joint``).
+    chart
+        What the six numbers mean.
+    latency_ms
+        Milliseconds per stage: read, preprocess, model, conformal, total.
+    """
+
+    seq: int
+    stamp_ns: int | None
+    source: str
+    status: Status
+    reasons: tuple[Reason, ...]
+    pose: Pose | None
+    region: ConformalSet
+    confidence: float
+    scope: Scope
+    chart: Chart
+    latency_ms: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def lower(self) -> Array:
+        """Shape (6,): tx ty tz (m), three rotation numbers (rad); -inf where unbounded."""
+        return self.region.lower
+
+    @property
+    def upper(self) -> Array:
+        """Shape (6,), as ``lower``; +inf where unbounded."""
+        return self.region.upper
+
+    @property
+    def bands(self) -> Bands | None:
+        """Disjoint intervals per DoF, or None where the set is its hull."""
+        return self.region.bands
+
+    @property
+    def bounded(self) -> bool:
+        """Whether all twelve bounds are finite."""
+        return bool(np.isfinite(self.lower).all() and np.isfinite(self.upper).all())
+
+    def covers(self, pose: Pose | ArrayLike) -> NDArray[np.bool_]:
+        """Say per DoF, shape (6,), whether the set holds a ``T_world_camera`` (Pose or shape (7,)).
+
+        Raises UsageError for an invalid frame: there is no set to ask.
+        """
+        if self.pose is None:
+            raise UsageError(f"frame {self.seq} is invalid: it has no set that could hold a pose")
+        other = pose if isinstance(pose, Pose) else Pose.from_array(pose)
+        return self.region.covers(self.chart.coordinates(other.to_array(), self.pose.to_array()))
+
+    def contains(self, pose: Pose | ArrayLike) -> bool:
+        """Whether the set holds this pose in all six degrees of freedom; see ``covers``."""
+        return bool(self.covers(pose).all())
+
+    def covariance(self) -> Array:
+        """Shape (6, 6), diagonal: (half-width / z)^2 in m^2 and rad^2, infinite where unbounded.
+
+        z is the normal quantile of the marginal confidence. A convention for filters that want a
+        covariance; the guarantee is that of the interval alone.
+        """
+        z = NormalDist().inv_cdf(0.5 + 0.5 * self.confidence)
+        return np.diag(((self.upper - self.lower) / (2.0 * z)) ** 2)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON record of this frame, as the README specifies it."""
+        pose: dict[str, Any] | None = None
+        interval: dict[str, Any] | None = None
+        if self.pose is not None:
+            lower, upper = self.lower.tolist(), self.upper.tolist()
+            bounded = self.bounded
+            pose = {"t_m": self.pose.t_m.tolist(), "q_xyzw": self.pose.q_xyzw.tolist()}
+            interval = {
+                "confidence": self.confidence,
+                "scope": self.scope,
+                "rotation": self.chart.rotation,
+                "lower": lower if bounded else _null_infinite(lower),
+                "upper": upper if bounded else _null_infinite(upper),
+                "bounded": bounded,
+                "bands": self.bands,
+            }
+        return {
+            "seq": self.seq,
+            "stamp_ns": self.stamp_ns,
+            "source": self.source,
+            "status": self.status,
+            "reasons": self.reasons,
+            "pose": pose,
+            "interval": interval,
+            "latency_ms": self.latency_ms,
+        }
+
+
+def _null_infinite(values: list[float]) -> list[float | None]:
+    return [value if np.isfinite(value) else None for value in values]

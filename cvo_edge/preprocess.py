@@ -1,0 +1,94 @@
+"""Camera image -> the model's input, bit-equal on every machine.
+
+Only exact integer operations: halving by averaging 2x2 pixels (``INTER_AREA`` at exactly one half)
+and ``INTER_LINEAR_EXACT``; the other OpenCV resizes differ between processors by a grey level,
+which an 8-bit network amplifies. Halving first also keeps the linear step from skipping pixels.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+
+Crop = Literal["none", "centre"]
+
+MIN_SIDE = 16
+
+
+def to_bgr8(image: object) -> Image | None:
+    """Any camera image -> (height, width, 3) uint8 BGR, or None where it is no such image.
+
+    Defined conversions: grey (two dimensions or one channel) is repeated, alpha is dropped, 16 bits
+    keep their upper eight.
+    """
+    if not isinstance(image, np.ndarray) or image.ndim not in (2, 3):
+        return None
+    if min(image.shape[:2]) < MIN_SIDE:
+        return None
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    if image.dtype != np.uint8:
+        return None
+    if image.ndim == 2 or image.shape[2] == 1:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    if image.shape[2] == 4:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2BGR), dtype=np.uint8)
+    return image if image.shape[2] == 3 else None
+
+
+def crop_box(
+    image_height: int, image_width: int, height: int, width: int, crop: Crop
+) -> tuple[int, int, int, int]:
+    """Rows and columns (top, bottom, left, right) that the model sees of an image of this size.
+
+    ``none``: all of it, squeezed to the target's shape; ``centre``: the largest centred part with
+    the aspect ratio of the target height and width.
+    """
+    if crop == "none":
+        return 0, image_height, 0, image_width
+    kept_height = min(image_height, image_width * height // width)
+    kept_width = min(image_width, image_height * width // height)
+    top, left = (image_height - kept_height) // 2, (image_width - kept_width) // 2
+    return top, top + kept_height, left, left + kept_width
+
+
+def resize(image: Image, height: int, width: int) -> Image:
+    """Halve while that is exact and leaves enough, then ``INTER_LINEAR_EXACT`` to the target."""
+    while (
+        image.shape[0] % 2 == 0
+        and image.shape[1] % 2 == 0
+        and image.shape[0] >= 2 * height
+        and image.shape[1] >= 2 * width
+    ):
+        half = (image.shape[1] // 2, image.shape[0] // 2)
+        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    if image.shape[:2] != (height, width):
+        image = np.asarray(
+            cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR_EXACT),
+            dtype=np.uint8,
+        )
+    return image
+
+
+def model_input(image_bgr: Image, height: int, width: int, crop: Crop) -> Image:
+    """Image (any height, any width, 3) BGR -> (1, height, width, 3) RGB, contiguous."""
+    top, bottom, left, right = crop_box(image_bgr.shape[0], image_bgr.shape[1], height, width, crop)
+    resized = resize(image_bgr[top:bottom, left:right], height, width)
+    return np.asarray(cv2.cvtColor(resized, cv2.COLOR_BGR2RGB), dtype=np.uint8)[np.newaxis]
+
+
+def selftest_image(height: int, width: int) -> Image:
+    """Build the image of recipe ``ripples-1``: (height, width, 3) uint8 BGR, integers alone.
+
+    Channel c of pixel (x, y) is ((x + 40 c)^2 + 2 y^2 + x y) // 64 mod 512, folded at 256: smooth
+    rings that grow finer to the lower right, so that the resize is tested with the network.
+    """
+    y, x = np.mgrid[0:height, 0:width].astype(np.int64)
+    channels = [((x + 40 * c) ** 2 + 2 * y**2 + x * y) // 64 % 512 for c in range(3)]
+    wave = np.stack(channels, axis=-1)
+    return np.where(wave < 256, wave, 511 - wave).astype(np.uint8)

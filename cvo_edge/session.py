@@ -1,0 +1,121 @@
+"""The only file that knows onnxruntime: model bytes -> a session that checks what it is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from cvo_edge.artifact import Dtype, ModelSpec, TensorSpec
+from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
+
+_DTYPES: dict[str, Dtype] = {"tensor(uint8)": "uint8", "tensor(float)": "float32"}
+
+
+def allowed_cores() -> int:
+    """Return the number of processor cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+class Session:
+    """One loaded model.
+
+    Parameters
+    ----------
+    model_bytes
+        The model itself, never a path: what was digest-checked is what runs, and a model cannot
+        reach for other files.
+    threads
+        Threads of one inference; all allowed cores by default.
+    expected
+        What the calibration says of inputs and outputs; None to take the model as it is.
+
+    Attributes
+    ----------
+    engine
+        The bare ``onnxruntime.InferenceSession``, for benchmarks beside it.
+    inputs, outputs
+        What the model itself declares.
+
+    Raises
+    ------
+    ModelError
+        onnxruntime refuses the model.
+    BundleMismatchError
+        Names, types or shapes differ from ``expected``.
+    """
+
+    def __init__(
+        self, model_bytes: bytes, threads: int | None = None, expected: ModelSpec | None = None
+    ) -> None:
+        if threads is not None and threads < 1:
+            raise UsageError(f"threads: expected at least 1, found {threads}")
+        self.threads = threads or allowed_cores()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = self.threads
+        options.inter_op_num_threads = 1
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
+        # Threads that spin between frames cost four times the processor time at camera rate; this
+        # keeps the speed inside one call and gives the cores back after it.
+        options.add_session_config_entry("session.force_spinning_stop", "1")
+        options.log_severity_level = 4
+        try:
+            self.engine = onnxruntime.InferenceSession(
+                model_bytes, options, providers=["CPUExecutionProvider"]
+            )
+        # onnxruntime raises a dozen unrelated types here, UnicodeDecodeError among them.
+        except Exception as error:
+            raise ModelError(f"model.onnx: refused by onnxruntime: {_one_line(error)}") from None
+        self.inputs = _tensors(self.engine.get_inputs(), "input")
+        self.outputs = _tensors(self.engine.get_outputs(), "output")
+        if expected is not None:
+            _compare("inputs", expected.inputs, self.inputs)
+            _compare("outputs", expected.outputs, self.outputs)
+        self._names = [spec.name for spec in self.outputs]
+
+    def run(self, feeds: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.float32]]:
+        """Input arrays by name -> output arrays by name; raises ModelError where it fails."""
+        try:
+            values = self.engine.run(None, feeds)
+        except Exception as error:
+            raise ModelError(f"model.onnx: inference failed: {_one_line(error)}") from None
+        return dict(zip(self._names, values, strict=True))
+
+
+def _tensors(arguments: list[onnxruntime.NodeArg], kind: str) -> tuple[TensorSpec, ...]:
+    tensors = []
+    for argument in arguments:
+        shape = tuple(argument.shape)
+        if argument.type not in _DTYPES or not all(isinstance(size, int) for size in shape):
+            raise BundleMismatchError(
+                f"model.onnx: expected {kind}s of uint8 or float32 with fixed shapes, "
+                f"found {argument.name} {argument.type} {list(shape)}"
+            )
+        tensors.append(TensorSpec(name=argument.name, dtype=_DTYPES[argument.type], shape=shape))
+    return tuple(tensors)
+
+
+def _compare(what: str, expected: tuple[TensorSpec, ...], found: tuple[TensorSpec, ...]) -> None:
+    if sorted(expected, key=_name) != sorted(found, key=_name):
+        raise BundleMismatchError(
+            f"model.onnx: expected {what} {_listed(expected)} (from calibration.json), "
+            f"found {_listed(found)}"
+        )
+
+
+def _name(spec: TensorSpec) -> str:
+    return spec.name
+
+
+def _listed(tensors: tuple[TensorSpec, ...]) -> str:
+    return ", ".join(f"{spec.name} {spec.dtype} {list(spec.shape)}" for spec in tensors)
+
+
+def _one_line(error: Exception) -> str:
+    line = " ".join(str(error).split())
+    return line if len(line) <= 200 else line[:197] + "..."

@@ -1,0 +1,164 @@
+"""Where estimates go: JSON lines, CSV or a TUM trajectory, one whole flushed line a frame."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Literal
+
+import msgspec
+
+from cvo_edge.errors import SinkError, UsageError
+from cvo_edge.pose import PoseInterval
+
+Format = Literal["jsonl", "csv", "tum"]
+
+_CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
+
+
+class Sink:
+    """Writes one line a frame and flushes it: an acknowledged record survives the process.
+
+    Parameters
+    ----------
+    path
+        Output file, replaced if it exists, or ``-`` for standard output.
+    format
+        ``jsonl``, ``csv`` or ``tum``.
+
+    Raises
+    ------
+    SinkError
+        The file cannot be opened or, later, written; every complete line is kept.
+    """
+
+    def __init__(self, path: str, format: Format) -> None:
+        self._name = "standard output" if path == "-" else path
+        self._header, self._line = _FORMATS[format]
+        self._owned = path != "-"
+        try:
+            self._stream: IO[bytes] = (
+                Path(path).open("wb") if self._owned else sys.stdout.buffer  # noqa: SIM115
+            )
+        except OSError as error:
+            raise SinkError(f"{path}: cannot be written: {error.strerror}") from None
+        self._started = False
+
+    def __enter__(self) -> Sink:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close the file, if it is one."""
+        if self._owned:
+            self._stream.close()
+
+    def write(self, estimate: PoseInterval) -> None:
+        """Write one estimate.
+
+        Raises SinkError where the disk refuses, BrokenPipeError where the reader has left, and
+        UsageError for a TUM line without a stamp.
+        """
+        if not self._started:
+            self._started = True
+            if self._header:
+                self._put(self._header(estimate))
+        line = self._line(estimate)
+        if line:
+            self._put(line)
+
+    def _put(self, line: bytes) -> None:
+        try:
+            self._stream.write(line)
+            self._stream.flush()
+        except BrokenPipeError:
+            if not self._owned:
+                # Python flushes stdout once more at exit; without this it would complain then.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise
+        except OSError as error:
+            raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
+
+
+def _json_line(estimate: PoseInterval) -> bytes:
+    return msgspec.json.encode(estimate.to_dict()) + b"\n"
+
+
+def _csv_header(estimate: PoseInterval) -> bytes:
+    dof = estimate.chart.dof
+    return _csv_row(
+        [
+            *("seq", "stamp_ns", "source", "status", "reasons"),
+            *("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"),
+            *("confidence", "scope", "rotation"),
+            *(f"{name}_lower" for name in dof),
+            *(f"{name}_upper" for name in dof),
+            "bounded",
+            *(f"{name}_bands" for name in dof),
+            *(f"{name}_ms" for name in _CSV_LATENCIES),
+        ]
+    )
+
+
+def _csv_line(estimate: PoseInterval) -> bytes:
+    record = estimate.to_dict()
+    pose, interval = record["pose"], record["interval"]
+    return _csv_row(
+        [
+            *(record["seq"], record["stamp_ns"], record["source"], str(record["status"])),
+            " ".join(record["reasons"]),
+            *([*pose["t_m"], *pose["q_xyzw"]] if pose else [None] * 7),
+            *(record["interval"][key] if interval else None for key in _INTERVAL_KEYS),
+            *(interval["lower"] if interval else [None] * 6),
+            *(interval["upper"] if interval else [None] * 6),
+            interval["bounded"] if interval else None,
+            *(_csv_bands(interval["bands"]) if interval and interval["bands"] else [None] * 6),
+            *(record["latency_ms"].get(stage) for stage in _CSV_LATENCIES),
+        ]
+    )
+
+
+_INTERVAL_KEYS = ("confidence", "scope", "rotation")
+
+
+def _csv_bands(bands: Iterable[Iterable[tuple[float, float]]]) -> list[str]:
+    return [" ".join(f"{low!r}:{high!r}" for low, high in dof) for dof in bands]
+
+
+def _csv_row(values: Iterable[object]) -> bytes:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerow(
+        "" if value is None else value for value in values
+    )
+    return buffer.getvalue().encode()
+
+
+def _tum_line(estimate: PoseInterval) -> bytes:
+    if estimate.pose is None:
+        return b""  # the format has no way to say "no pose"
+    if estimate.stamp_ns is None:
+        raise UsageError(
+            f"tum: expected a stamp for every frame, found none for {estimate.source or 'frame'}; "
+            "give --fps"
+        )
+    seconds, rest = divmod(estimate.stamp_ns, 1_000_000_000)
+    numbers = " ".join(f"{value:.9f}" for value in estimate.pose.to_array().tolist())
+    return f"{seconds}.{rest:09d} {numbers}\n".encode()
+
+
+_LineWriter = Callable[[PoseInterval], bytes]
+_FORMATS: dict[Format, tuple[_LineWriter | None, _LineWriter]] = {
+    "jsonl": (None, _json_line),
+    "csv": (_csv_header, _csv_line),
+    "tum": (None, _tum_line),
+}

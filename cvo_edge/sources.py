@@ -1,0 +1,213 @@
+"""Where frames come from: a folder or glob of images, a video file, a camera."""
+
+from __future__ import annotations
+
+import glob
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.errors import SourceError, UsageError
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
+
+_JPEG_END = b"\xff\xd9"
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of a source, or its absence.
+
+    ``image`` is (height, width, 3) uint8 BGR, or None where it could not be read whole;
+    ``stamp_ns`` is None where the source has no clock; ``read_ms`` what reading and decoding took.
+    """
+
+    image: NDArray[np.uint8] | None
+    stamp_ns: int | None
+    source: str
+    read_ms: float
+
+
+class Source(Protocol):
+    """Something that yields frames once, in order; ``length`` is None where it has no end."""
+
+    length: int | None
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames."""
+
+
+def open_source(text: str, fps: float | None = None) -> Source:
+    """Guess from what ``text`` is: a folder, a glob, a video file, a camera's index or device.
+
+    Parameters
+    ----------
+    text
+        Folder of images (natural order; only ``*.color.*`` where there are any, never
+        ``*.depth.*``), a glob pattern, a video file, a camera index such as ``0``, or a device
+        path such as ``/dev/video0``.
+    fps
+        Frames per second to stamp frames with, starting at zero, instead of the source's own.
+
+    Raises
+    ------
+    SourceError
+        There is no such source, or no image in it.
+    UsageError
+        ``fps`` is not positive.
+    """
+    if fps is not None and not 0.0 < fps < float("inf"):
+        raise UsageError(f"fps: expected a positive number, found {fps}")
+    path = Path(text)
+    if path.is_dir():
+        return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
+    if path.is_char_device() or text.isdecimal():
+        return Camera(int(text) if text.isdecimal() else text, fps)
+    if path.is_file():
+        if path.suffix.lower() in IMAGE_SUFFIXES:
+            return ImageFiles([path], fps, "")
+        return Video(path, fps)
+    if glob.has_magic(text):
+        found = [Path(name) for name in glob.glob(text, recursive=True) if Path(name).is_file()]
+        return ImageFiles(_colour_images(found), fps, f"{text}: expected images, found no match")
+    raise SourceError(
+        f"{text}: expected a folder, glob, video file, camera index or device, found none of these"
+    )
+
+
+def natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key that reads digits as numbers: ``frame-2`` before ``frame-10``."""
+    parts = re.split(r"(\d+)", str(path))
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts if part]
+
+
+def decode_image(content: bytes) -> NDArray[np.uint8] | None:
+    """Bytes of an image file -> (height, width, 3) uint8 BGR, or None where it is not whole.
+
+    The camera's own pixel order is kept (no EXIF rotation). Some OpenCV versions decode a cut JPEG
+    to a full-size wrong picture, so its end marker is looked for first.
+    """
+    if not content:
+        return None
+    if content.startswith(b"\xff\xd8") and _JPEG_END not in content[-1024:]:
+        return None
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
+    except cv2.error:
+        return None
+    return None if image is None else np.asarray(image, dtype=np.uint8)
+
+
+class ImageFiles:
+    """Image files in the given order; an unreadable one costs that frame only."""
+
+    def __init__(self, paths: list[Path], fps: float | None, if_empty: str) -> None:
+        if not paths:
+            raise SourceError(if_empty)
+        self._paths = paths
+        self._fps = fps
+        self.length: int | None = len(paths)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield one frame a file."""
+        for seq, path in enumerate(self._paths):
+            start = perf_counter()
+            try:
+                image = decode_image(path.read_bytes())
+            except OSError:
+                image = None
+            yield Frame(image, _stamp(seq, self._fps), path.name, 1e3 * (perf_counter() - start))
+
+
+class Video:
+    """A video file; stamps come from its frame rate unless ``fps`` is given."""
+
+    def __init__(self, path: Path, fps: float | None) -> None:
+        self._path = path
+        self._capture = _open_capture(str(path))
+        own = float(self._capture.get(cv2.CAP_PROP_FPS))
+        self._fps = fps or (own if 0.0 < own < 1e5 else None)
+        announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.length: int | None = announced if announced > 0 else None
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames; raises SourceError where the file ends before its own count."""
+        seq = 0
+        try:
+            while True:
+                start = perf_counter()
+                found, image = self._capture.read()
+                if not found:
+                    break
+                spent = 1e3 * (perf_counter() - start)
+                name = f"{self._path.name}#{seq}"
+                yield Frame(np.asarray(image, np.uint8), _stamp(seq, self._fps), name, spent)
+                seq += 1
+        finally:
+            self._capture.release()
+        if self.length is not None and seq < self.length:
+            raise SourceError(
+                f"{self._path}: expected {self.length} frames, found it ended early: "
+                f"{seq} of {self.length}"
+            )
+
+
+class Camera:
+    """A camera by index or device path; stamps are the machine's clock when a frame arrived."""
+
+    def __init__(self, device: int | str, fps: float | None) -> None:
+        self._device = device
+        self._fps = fps
+        self._capture = _open_capture(device)
+        self.length: int | None = None
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames until the camera gives none; that raises SourceError."""
+        seq = 0
+        try:
+            while True:
+                start = perf_counter()
+                found, image = self._capture.read()
+                if not found:
+                    raise SourceError(f"camera {self._device}: gave no frame after {seq} frames")
+                stamp_ns = _stamp(seq, self._fps) if self._fps else time.time_ns()
+                spent = 1e3 * (perf_counter() - start)
+                name = f"{self._device}#{seq}"
+                yield Frame(np.asarray(image, np.uint8), stamp_ns, name, spent)
+                seq += 1
+        finally:
+            self._capture.release()
+
+
+def _images_in(folder: Path) -> list[Path]:
+    return _colour_images([path for path in folder.iterdir() if path.is_file()])
+
+
+def _colour_images(paths: list[Path]) -> list[Path]:
+    images = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [path for path in images if ".depth." not in path.name]
+    colour = [path for path in images if ".color." in path.name]
+    return sorted(colour or images, key=natural_key)
+
+
+def _stamp(seq: int, fps: float | None) -> int | None:
+    return None if fps is None else round(seq * 1_000_000_000 / fps)
+
+
+def _open_capture(device: int | str) -> cv2.VideoCapture:
+    try:
+        capture = cv2.VideoCapture(device)
+    except cv2.error:
+        capture = None
+    if capture is None or not capture.isOpened():
+        raise SourceError(f"{device}: expected a video or camera that opens, found none")
+    return capture

@@ -1,0 +1,120 @@
+"""Ground-truth poses from files: 7-Scenes ``.pose.txt`` folders and TUM trajectories."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge import geometry
+from cvo_edge.errors import SourceError
+from cvo_edge.pose import PoseInterval
+
+Array = NDArray[np.float64]
+
+MATRIX_SUFFIX = ".pose.txt"
+
+# Frames are matched to the nearest ground-truth stamp within this bound, as the TUM tools do.
+_MAX_STAMP_DIFFERENCE_NS = 20_000_000
+
+
+def read_pose_matrix(path: Path) -> Array | None:
+    """Read a 4x4 camera-to-world matrix in metres -> pose (7,), or None where it is no pose.
+
+    The rotation is made orthonormal (recorded ones are off by up to 4e-4); a matrix that is not
+    finite, whose rotation part is further than 0.01 from a rotation, or that is no text of 16
+    numbers, is no pose: tracking was lost there.
+    """
+    try:
+        T = np.array(path.read_text("ascii").split(), dtype=np.float64)
+    except (OSError, ValueError):
+        return None
+    if T.size != 16 or not np.isfinite(T).all():
+        return None
+    T = T.reshape(4, 4)
+    R = geometry.nearest_rotation(T[:3, :3])
+    if np.abs(R - T[:3, :3]).max() > 0.01 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
+        return None
+    return np.concatenate([T[:3, 3], geometry.matrix_to_quaternion(R)])
+
+
+class GroundTruth:
+    """True poses to hold against estimates; see ``open_ground_truth``."""
+
+    def __init__(self, by_name: dict[str, Array], stamps_ns: list[int], poses: list[Array]) -> None:
+        self._by_name = by_name
+        self._stamps_ns = stamps_ns
+        self._poses = poses
+
+    def pose_of(self, estimate: PoseInterval) -> Array | None:
+        """Return the true ``T_world_camera`` (7,) of an estimate's frame, or None."""
+        if self._by_name:
+            return self._by_name.get(estimate.source.split(".")[0])
+        if estimate.stamp_ns is None or not self._stamps_ns:
+            return None
+        right = bisect_left(self._stamps_ns, estimate.stamp_ns)
+        nearest = min(
+            range(max(0, right - 1), min(right + 1, len(self._stamps_ns))),
+            key=lambda index: abs(self._stamps_ns[index] - (estimate.stamp_ns or 0)),
+        )
+        difference = abs(self._stamps_ns[nearest] - estimate.stamp_ns)
+        return self._poses[nearest] if difference <= _MAX_STAMP_DIFFERENCE_NS else None
+
+
+def open_ground_truth(path: Path) -> GroundTruth:
+    """Read a folder of ``<frame>.pose.txt`` (matched by name) or a TUM file (matched by stamp).
+
+    Raises SourceError where there is no pose to be had.
+    """
+    if path.is_dir():
+        found = {
+            file.name.removesuffix(MATRIX_SUFFIX): read_pose_matrix(file)
+            for file in sorted(path.glob("*" + MATRIX_SUFFIX))
+        }
+        by_name = {name: pose for name, pose in found.items() if pose is not None}
+        if not by_name:
+            raise SourceError(f"{path}: expected files *{MATRIX_SUFFIX}, found no valid one")
+        return GroundTruth(by_name, [], [])
+    return GroundTruth({}, *_read_tum(path))
+
+
+def _read_tum(path: Path) -> tuple[list[int], list[Array]]:
+    try:
+        lines = path.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: expected a TUM trajectory, found {error}") from None
+    stamps: list[int] = []
+    poses: list[Array] = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        fields = line.split()
+        try:
+            values = np.array(fields, dtype=np.float64)
+        except ValueError:
+            values = np.empty(0)
+        if values.size != 8 or not np.isfinite(values).all() or not values[4:].any():
+            raise SourceError(
+                f"{path}: expected eight numbers stamp tx ty tz qx qy qz qw, found {line!r} "
+                f"in line {number}"
+            )
+        seconds, _, fraction = fields[0].partition(".")
+        exact = seconds.isdecimal() and (fraction.isdecimal() or not fraction)
+        stamp = (
+            # A double holds present-day stamps to 200 ns only: count the digits instead.
+            int(seconds) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
+            if exact
+            else round(values[0] * 1e9)
+        )
+        if stamps and stamp <= stamps[-1]:
+            raise SourceError(
+                f"{path}: expected growing stamps, found {fields[0]} in line {number}"
+            )
+        stamps.append(stamp)
+        quaternion = geometry.quaternion_normalise(values[4:])
+        poses.append(np.concatenate([values[1:4], quaternion]))
+    if not stamps:
+        raise SourceError(f"{path}: expected a TUM trajectory, found no line")
+    return stamps, poses

@@ -1,0 +1,7 @@
+"""Training side of cvo-edge: data sets, networks, export to ONNX, calibration, evaluation."""
+
+from __future__ import annotations
+
+__version__ = "0.1.0"
+
+__all__ = ["__version__"]

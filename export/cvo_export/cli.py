@@ -1,0 +1,277 @@
+"""The command line ``cvo-export``: argument parsing and exit codes only."""
+
+from __future__ import annotations
+
+import json
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from cvo_edge.cli import guarded, write_text
+from cvo_edge.errors import UsageError
+from cvo_export.progress import show_progress
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Train a pose network with bounds, export it to one ONNX graph, calibrate it, evaluate "
+    "it. DATASET is FORMAT:PATH, e.g. 7scenes:scenes/redkitchen or synthetic:room.",
+)
+
+
+class MethodName(StrEnum):
+    """Methods that can be trained."""
+
+    CJP = "cjp"
+
+
+class SplitName(StrEnum):
+    """How frames get their roles."""
+
+    RANDOM = "random"
+    BLOCK = "block"
+    SEQUENCE = "sequence"
+
+
+class CropName(StrEnum):
+    """What the model sees of an image."""
+
+    NONE = "none"
+    CENTRE = "centre"
+
+
+class NormalisationName(StrEnum):
+    """Mean and deviation that pixels are normalised with."""
+
+    HALF = "half"
+    TIMM = "timm"
+
+
+class LatentName(StrEnum):
+    """What inference draws from the latent Gaussian."""
+
+    MEAN = "mean"
+    CODEBOOK = "codebook"
+    SAMPLE = "sample"
+
+
+class BoundsName(StrEnum):
+    """How the network gives its bounds."""
+
+    SOFTPLUS = "softplus"
+    FREE = "free"
+
+
+class GateName(StrEnum):
+    """Which coverage gates the calibration loss."""
+
+    CORRECTED = "corrected"
+    LITERAL = "literal"
+
+
+class IntervalFormName(StrEnum):
+    """Which reading of the interval score trains the bounds."""
+
+    PROPER = "proper"
+    MEAN = "mean"
+    SUM = "sum"
+
+
+class RuleName(StrEnum):
+    """What the calibration counts as one draw: a frame, or a sequence."""
+
+    POOLED = "pooled"
+    HIERARCHICAL = "hierarchical"
+
+
+class SubsetName(StrEnum):
+    """The frames recorded as test, or all of data that the run has not seen."""
+
+    TEST = "test"
+    ALL = "all"
+
+
+DatasetArgument = Annotated[
+    str, typer.Argument(help="FORMAT:PATH, e.g. 7scenes:scenes/redkitchen.", show_default=False)
+]
+
+
+@app.command()
+def train(
+    method: Annotated[MethodName, typer.Argument(help="Conformal method.", show_default=False)],
+    dataset: DatasetArgument,
+    run_dir: Annotated[
+        Path,
+        typer.Argument(help="New folder; or one to go on with, same options.", show_default=False),
+    ],
+    backbone: Annotated[str, typer.Option(help="Any timm model.")] = "mobilenetv2_100",
+    weights: Annotated[
+        str,
+        typer.Option(help="timm (downloads), a safetensors file, or none (random, untrained)."),
+    ] = "timm",
+    stages: Annotated[
+        str,
+        typer.Option(help="Strides of the stages used, e.g. 16 or 8,16; final: the last layer."),
+    ] = "16",
+    grid: Annotated[
+        str, typer.Option(help="Rows x columns each stage is averaged to; 1x1: global mean.")
+    ] = "3x4",
+    normalisation: Annotated[
+        NormalisationName | None,
+        typer.Option(help="Pixel scaling; half (x - 127.5)/127.5 for a file, timm for timm's."),
+    ] = None,
+    size: Annotated[str, typer.Option(help="Width x height of the model's input.")] = "256x192",
+    crop: Annotated[CropName, typer.Option(help="What the model sees.")] = CropName.NONE,
+    split: Annotated[
+        SplitName | None,
+        typer.Option(help="sequence where there are five or more, else block."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Decides split, training and noise.")] = 0,
+    copies: Annotated[
+        int | None, typer.Option(min=0, help="Augmented copies of each training frame.")
+    ] = None,
+    rotation_deg: Annotated[
+        float | None, typer.Option(min=0, help="Camera turns of the copies, deviation per axis.")
+    ] = None,
+    light: Annotated[
+        float | None, typer.Option(min=0, help="Changes of light of the copies, 0 to 1.")
+    ] = None,
+    fine_tune: Annotated[
+        int | None, typer.Option(min=0, help="Epochs of training the backbone, too; 0: frozen.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=100, help="Steps of training the head.")] = None,
+    latent_size: Annotated[int, typer.Option(min=1, help="The paper's is 3.")] = 16,
+    latent: Annotated[LatentName, typer.Option(help="The paper's is sample.")] = LatentName.MEAN,
+    bounds: Annotated[
+        BoundsName, typer.Option(help="free: three outputs, sorted.")
+    ] = BoundsName.SOFTPLUS,
+    sharpness: Annotated[
+        float, typer.Option(min=0, max=1, help="lambda of the calibration loss.")
+    ] = 0.5,
+    gate: Annotated[
+        GateName, typer.Option(help="literal: the paper's Eq. 5a.")
+    ] = GateName.CORRECTED,
+    interval_form: Annotated[
+        IntervalFormName, typer.Option(help="mean: the paper's text.")
+    ] = IntervalFormName.PROPER,
+    kl_weight: Annotated[float, typer.Option(min=0, help="beta of the divergence.")] = 1e-3,
+) -> None:
+    """Train a method on a data set; interrupted, the same command goes on."""
+    from cvo_export.configure import configure
+    from cvo_export.train import train as train_run
+
+    config = configure(
+        method=method.value,
+        dataset=dataset,
+        split=split.value if split else None,
+        seed=seed,
+        size=size,
+        crop=crop.value,
+        backbone=backbone,
+        weights=weights,
+        stages=stages,
+        grid=grid,
+        normalisation=normalisation.value if normalisation else None,
+        copies=copies,
+        rotation_deg=rotation_deg,
+        light=light,
+        fine_tune=fine_tune,
+        steps=steps,
+        head={
+            "latent_size": latent_size,
+            "latent": latent.value,
+            "bounds": bounds.value,
+            "sharpness": sharpness,
+            "gate": gate.value,
+            "interval_form": interval_form.value,
+            "kl_weight": kl_weight,
+        },
+    )
+    with show_progress() as progress:
+        run = train_run(run_dir, config, progress)
+    print(*run.lines(), sep="\n", file=sys.stderr)
+
+
+@app.command()
+def publish(
+    run_dir: Annotated[Path, typer.Argument(help="A finished run.", show_default=False)],
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder to write.", show_default=False)],
+    rule: Annotated[
+        RuleName | None,
+        typer.Option(help="hierarchical for a run split by sequence, else pooled."),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="The folder's name by default.")] = None,
+    dataset: Annotated[
+        str | None, typer.Option(help="Where the data set is now, if it has moved.")
+    ] = None,
+) -> None:
+    """Export a run to ONNX, calibrate that graph and write its bundle."""
+    from cvo_edge.describe import inspect_lines
+    from cvo_export.publish import publish as publish_run
+    from cvo_export.train import load_run
+
+    run = load_run(run_dir, dataset)
+    calibration = publish_run(
+        run, bundle, name or bundle.resolve().name, rule.value if rule else None
+    )
+    print(*inspect_lines(calibration), sep="\n")
+
+
+@app.command()
+def evaluate(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
+    dataset: DatasetArgument,
+    subset: Annotated[
+        SubsetName, typer.Option(help="The run's test frames, or all of unseen data.")
+    ] = SubsetName.TEST,
+    json_file: Annotated[
+        str | None, typer.Option("--json", help="Write the report as JSON to a file or -.")
+    ] = None,
+    min_coverage: Annotated[
+        float | None,
+        typer.Option(min=0, max=1, help="Exit 8 where a DoF covers less at 0.9 marginal."),
+    ] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of one inference.")] = None,
+) -> None:
+    """Coverage, width and error of a bundle on held-out frames."""
+    from cvo_export.datasets import open_dataset
+    from cvo_export.evaluate import check_coverage, table
+    from cvo_export.evaluate import evaluate as evaluate_bundle
+
+    report = evaluate_bundle(bundle, open_dataset(dataset), subset.value, threads)
+    if json_file is not None:
+        write_text(json_file, json.dumps(report, indent=1) + "\n")
+    if json_file != "-":
+        print(*table(report), sep="\n")
+    if min_coverage is not None:
+        check_coverage(report, min_coverage)
+
+
+@app.command()
+def render(
+    dataset: DatasetArgument,
+    folder: Annotated[Path, typer.Argument(help="New folder.", show_default=False)],
+    sequence: Annotated[str, typer.Option(help="Name of one sequence.")],
+    frames: Annotated[int | None, typer.Option(min=1, help="Only the first so many.")] = None,
+) -> None:
+    """Write one sequence as a 7-Scenes folder: JPEG images and .pose.txt."""
+    from cvo_export.datasets import open_dataset
+    from cvo_export.datasets.seven_scenes import write_sequence
+
+    opened = open_dataset(dataset)
+    if sequence not in opened.sequence_names:
+        raise UsageError(
+            f"sequence: expected one of {opened.sequence_names[0]} to "
+            f"{opened.sequence_names[-1]}, found {sequence}"
+        )
+    count = write_sequence(opened, opened.sequence_names.index(sequence), folder, frames)
+    print(f"{folder}: {count} frames of {sequence}")
+
+
+def main() -> NoReturn:
+    """Entry point of ``cvo-export``."""
+    guarded("cvo-export", app)

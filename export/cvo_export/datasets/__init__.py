@@ -1,0 +1,35 @@
+"""Data sets by name: ``FORMAT:PATH``, one format a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from cvo_edge.errors import UsageError
+from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.seven_scenes import open_seven_scenes
+from cvo_export.datasets.synthetic import open_room
+
+__all__ = ["FORMATS", "Intrinsics", "PoseDataset", "open_dataset"]
+
+FORMATS: dict[str, Callable[[str], PoseDataset]] = {
+    "7scenes": open_seven_scenes,
+    "synthetic": open_room,
+}
+
+
+def open_dataset(text: str) -> PoseDataset:
+    """Open ``FORMAT:PATH``, e.g. ``7scenes:scenes/redkitchen`` or ``synthetic:room``.
+
+    Raises
+    ------
+    UsageError
+        The format is not known.
+    SourceError
+        The data set cannot be read or holds no posed frame.
+    """
+    name, colon, path = text.partition(":")
+    if not colon or name not in FORMATS:
+        raise UsageError(
+            f"data set: expected FORMAT:PATH with FORMAT one of {', '.join(FORMATS)}, found {text!r}"
+        )
+    return FORMATS[name](path)

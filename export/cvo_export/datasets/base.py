@@ -1,0 +1,63 @@
+"""What every data set reader returns: images with a camera pose each, in sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Intrinsics(NamedTuple):
+    """A pinhole camera: focal lengths and principal point, all in pixels of the full image."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True)
+class PoseDataset:
+    """Images with a known camera pose, grouped in sequences (one continuous recording each).
+
+    Attributes
+    ----------
+    name
+        Free name for reports and provenance; never a path.
+    poses
+        Shape (n, 7), float64: tx ty tz in metres, then the unit quaternion qx qy qz qw of
+        ``T_world_camera`` (OpenCV camera: x right, y down, z forward), frame by frame.
+    sequence
+        Shape (n,), integer: index into ``sequence_names``; frames of one sequence are contiguous
+        and in time order.
+    sequence_names
+        One name a sequence.
+    frame_names
+        One name a frame, unique in the data set, e.g. ``seq-01/frame-000007``.
+    read_image
+        Frame number -> image, shape (height, width, 3), uint8, BGR. Raises ``SourceError`` where
+        the image cannot be read.
+    intrinsics
+        The camera, or None where the data set does not say.
+    own_train, own_test
+        Sequence indices of the data set's own train and test lists; both empty where it has none.
+    skipped
+        Reason -> number of frames left out by the reader.
+    """
+
+    name: str
+    poses: NDArray[np.float64]
+    sequence: NDArray[np.int64]
+    sequence_names: tuple[str, ...]
+    frame_names: tuple[str, ...]
+    read_image: Callable[[int], NDArray[np.uint8]]
+    intrinsics: Intrinsics | None = None
+    own_train: frozenset[int] = frozenset()
+    own_test: frozenset[int] = frozenset()
+    skipped: Mapping[str, int] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.poses)

@@ -1,0 +1,138 @@
+"""7-Scenes (Shotton et al. 2013): ``seq-NN/frame-NNNNNN.color.png|jpg`` beside ``.pose.txt``.
+
+A pose file holds the 4x4 camera-to-world matrix in metres, OpenCV camera. ``TrainSplit.txt`` and
+``TestSplit.txt`` list ``sequenceN``. A folder with the frames of a single sequence is read as well.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.errors import SinkError, SourceError
+from cvo_edge.pose import Pose
+from cvo_edge.sources import decode_image, natural_key
+from cvo_edge.trajectory import MATRIX_SUFFIX, read_pose_matrix
+from cvo_export.datasets.base import Intrinsics, PoseDataset
+
+_COLOUR = (".color.png", ".color.jpg")
+
+# The Kinect's nominal focal length, given by the data set's authors for 640x480.
+_NOMINAL_FOCAL_PX, _NOMINAL_WIDTH = 585.0, 640
+
+
+def open_seven_scenes(path: str) -> PoseDataset:
+    """Read a scene folder with ``seq-NN`` folders, or one such folder.
+
+    Frames without a pose file, or with one that is no pose (lost tracking), are left out and
+    counted. Intrinsics come from ``camera-intrinsics.txt`` (a 3x3 matrix) where there is one, else
+    the data set's nominal focal length scaled to the images' width.
+
+    Raises SourceError where there is no posed frame.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise SourceError(f"{root}: expected a 7-Scenes folder, found none")
+    folders = sorted(root.glob("seq-*"), key=natural_key)
+    folders = [folder for folder in folders if folder.is_dir()] or [root]
+    skipped: Counter[str] = Counter()
+    images: list[Path] = []
+    poses: list[NDArray[np.float64]] = []
+    sequence: list[int] = []
+    for number, folder in enumerate(folders):
+        for image in _colour_images(folder):
+            pose_file = folder / (image.name.split(".")[0] + MATRIX_SUFFIX)
+            if not pose_file.is_file():
+                skipped["no pose file"] += 1
+                continue
+            pose = read_pose_matrix(pose_file)
+            if pose is None:
+                skipped["invalid pose"] += 1
+                continue
+            images.append(image)
+            poses.append(pose)
+            sequence.append(number)
+    if not images:
+        found = ", ".join(f"{count} with {reason}" for reason, count in skipped.items()) or "none"
+        raise SourceError(f"{root}: expected frames with a pose, found {found}")
+    names = tuple(folder.name for folder in folders)
+
+    def read_image(index: int) -> NDArray[np.uint8]:
+        image = decode_image(images[index].read_bytes())
+        if image is None:
+            raise SourceError(f"{images[index]}: expected a whole image, found a damaged one")
+        return image
+
+    return PoseDataset(
+        name=root.resolve().name,
+        poses=np.array(poses),
+        sequence=np.array(sequence),
+        sequence_names=names,
+        frame_names=tuple(
+            f"{names[number]}/{image.name.split('.')[0]}"
+            for number, image in zip(sequence, images, strict=True)
+        ),
+        read_image=read_image,
+        intrinsics=_intrinsics(root, read_image(0).shape),
+        own_train=_own_list(root / "TrainSplit.txt", names),
+        own_test=_own_list(root / "TestSplit.txt", names),
+        skipped=dict(skipped),
+    )
+
+
+def write_sequence(dataset: PoseDataset, sequence: int, folder: Path, frames: int | None) -> int:
+    """Write the first ``frames`` of a sequence in this layout, JPEG quality 92; returns how many.
+
+    Raises SinkError where the folder exists or cannot be written.
+    """
+    indices = np.flatnonzero(dataset.sequence == sequence)[:frames]
+    try:
+        folder.mkdir(parents=True)
+        for number, index in enumerate(indices.tolist()):
+            stem = f"frame-{number:06d}"
+            image = dataset.read_image(index)
+            encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
+            (folder / f"{stem}.color.jpg").write_bytes(encoded.tobytes())
+            matrix = Pose.from_array(dataset.poses[index]).to_matrix()
+            rows = "\n".join("\t".join(f"{value:.9e}" for value in row) for row in matrix)
+            (folder / (stem + MATRIX_SUFFIX)).write_text(rows + "\n", "ascii")
+    except FileExistsError:
+        raise SinkError(f"{folder}: expected a new folder, found one that exists") from None
+    except OSError as error:
+        raise SinkError(f"{folder}: cannot be written: {error.strerror}") from None
+    return int(indices.size)
+
+
+def _colour_images(folder: Path) -> list[Path]:
+    found = [path for suffix in _COLOUR for path in folder.glob("*" + suffix)]
+    return sorted(found, key=natural_key)
+
+
+def _own_list(path: Path, names: tuple[str, ...]) -> frozenset[int]:
+    """Indices of the sequences a split file lists; those that are not on disk are left out."""
+    if not path.is_file():
+        return frozenset()
+    numbers = {int(number) for number in re.findall(r"\d+", path.read_text("ascii"))}
+    return frozenset(
+        index
+        for index, name in enumerate(names)
+        if name.startswith("seq-") and int(name.removeprefix("seq-")) in numbers
+    )
+
+
+def _intrinsics(root: Path, shape: tuple[int, ...]) -> Intrinsics:
+    height, width = shape[:2]
+    path = root / "camera-intrinsics.txt"
+    if not path.is_file():
+        focal = _NOMINAL_FOCAL_PX * width / _NOMINAL_WIDTH
+        return Intrinsics(focal, focal, width / 2, height / 2)
+    try:
+        K = np.array(path.read_text("ascii").split(), dtype=np.float64).reshape(3, 3)
+    except ValueError:
+        raise SourceError(f"{path}: expected nine numbers of a 3x3 matrix") from None
+    return Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))

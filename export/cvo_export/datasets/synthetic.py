@@ -1,0 +1,166 @@
+"""The synthetic room as a data set: flights with exact poses, for the demonstration and tests.
+
+The scene is the same for every seed (``cvo_export.scene.room``, which also states the world frame);
+the seed draws the flights, their light and their noise. The principal point is the middle of the
+image, ((width - 1) / 2, (height - 1) / 2); motion blur is centred on the pose of its frame.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from cvo_edge.errors import UsageError
+from cvo_edge.geometry import quaternion_exp, quaternion_multiply
+from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.scene.renderer import Floats, Image, as_image
+from cvo_export.scene.room import room
+from cvo_export.scene.sensor import Light, add_noise, motion_blur
+
+# ------------------------------------------------------------------------------- specification
+
+_FOCAL_PER_WIDTH = 0.9140625  # Kinect: 585 px at 640 px, a horizontal field of view of 57 degrees
+
+
+class _Options(NamedTuple):
+    flights: int = 48
+    frames: int = 50
+    width: int = 320
+    height: int = 240
+    seed: int = 0
+
+
+def open_room(spec: str = "room") -> PoseDataset:
+    """Open the synthetic room; images are rendered when they are read.
+
+    Parameters
+    ----------
+    spec
+        ``room``, then any of ``,flights=48`` (1..1000), ``,frames=50`` (a flight, 1..10000),
+        ``,size=320x240`` (64x48..1920x1080) and ``,seed=0`` (0..4294967295). Flight i and its frame
+        j depend on the seed, i and j alone: asking for more leaves the earlier ones as they were.
+
+    Returns
+    -------
+    PoseDataset
+        Named ``synthetic-room``, with one sequence a flight. ``read_image`` may be called from
+        several threads, in any order, and raises ``IndexError`` past the last frame.
+
+    Raises
+    ------
+    UsageError
+        The specification has another name, an unknown or repeated option, or a value out of range.
+    """
+    options = _parse(spec)
+    fx = _FOCAL_PER_WIDTH * options.width
+    intrinsics = Intrinsics(fx, fx, (options.width - 1) / 2, (options.height - 1) / 2)
+    flights = [_Flight(options.seed, number) for number in range(options.flights)]
+    times_s = np.arange(options.frames, dtype=np.float64) * _FRAME_TIME_S
+    names = tuple(f"flight-{number:02d}" for number in range(1, options.flights + 1))
+
+    def read_image(index: int) -> Image:
+        flight, frame = divmod(range(options.flights * options.frames)[index], options.frames)
+        return flights[flight].photograph(frame, intrinsics, (options.width, options.height))
+
+    return PoseDataset(
+        name="synthetic-room",
+        poses=np.concatenate([flight.poses(times_s) for flight in flights]),
+        sequence=np.repeat(np.arange(options.flights), options.frames),
+        sequence_names=names,
+        frame_names=tuple(f"{name}/frame-{j:06d}" for name in names for j in range(options.frames)),
+        read_image=read_image,
+        intrinsics=intrinsics,
+    )
+
+
+def _parse(spec: str) -> _Options:
+    name, *items = spec.split(",")
+    if name != "room":
+        raise UsageError(f"expected a synthetic scene named room, found {name!r} in {spec!r}")
+    values: dict[str, int] = {}
+    for item in items:
+        key, _, text = item.partition("=")
+        if key == "size":
+            width, _, height = text.partition("x")
+            found = {"width": width, "height": height}
+        elif key in ("flights", "frames", "seed"):
+            found = {key: text}
+        else:
+            raise UsageError(
+                f"expected an option flights=, frames=, size= or seed=, found {item!r} in {spec!r}"
+            )
+        for field, digits in found.items():
+            if field in values:
+                raise UsageError(f"expected {key} once, found it again in {spec!r}")
+            low, high = _RANGES[field]
+            if not (digits.isascii() and digits.isdigit() and low <= int(digits) <= high):
+                raise UsageError(f"expected {_EXPECTED[key]}, found {item!r} in {spec!r}")
+            values[field] = int(digits)
+    return _Options(**values)
+
+
+_RANGES = {
+    "flights": (1, 1000),
+    "frames": (1, 10000),
+    "width": (64, 1920),
+    "height": (48, 1080),
+    "seed": (0, 2**32 - 1),
+}
+_EXPECTED = {
+    "flights": "flights=1..1000",
+    "frames": "frames=1..10000",
+    "size": "size=WIDTHxHEIGHT between 64x48 and 1920x1080",
+    "seed": "seed=0..4294967295",
+}
+
+# ------------------------------------------------------------------------------------- flights
+
+_FRAME_TIME_S = 1 / 30
+_EXPOSURE_S = 1 / 200
+
+# Every degree of freedom is a sum of three sinusoids whose amplitudes add up to its reach: it is
+# smooth, cannot leave centre +- reach, and has a standard deviation of 0.44 times the reach. The
+# volume is small enough for a small network to learn, the pace that of a hand-held camera.
+_CENTRE = np.array([0.0, -0.4, 1.3, 0.0, 0.0, 0.0])  # x y z in metres; yaw pitch roll in radians
+_REACH = np.array([0.4, 0.3, 0.15, *np.radians([17.5, 7.5, 4.0])])
+_TURNS = {3: np.array([0, 0, 1]), 4: np.array([1, 0, 0]), 5: np.array([0, 0, 1])}
+_LEVEL = quaternion_exp([-math.pi / 2, 0, 0])  # looks along world y, its image's top towards z
+_SHARES = np.array([0.5, 0.35, 0.15])
+_RATES_RAD_S = np.array([1.28, 2.72, 4.8])
+
+
+class _Flight:
+    """One camera trajectory over continuous time, its light and its sensor noise."""
+
+    def __init__(self, seed: int, number: int) -> None:
+        self._entropy = (seed, number)
+        rng = self._rng(0)
+        self._rate = _RATES_RAD_S * rng.uniform(0.8, 1.25, (6, 3))
+        self._phase = rng.uniform(0, 2 * math.pi, (6, 3))
+        self._light = Light(rng)
+
+    def _rng(self, stream: int) -> np.random.Generator:
+        return np.random.default_rng((*self._entropy, stream))
+
+    def poses(self, times_s: Floats) -> Floats:
+        """Return ``T_world_camera`` at some times, shape (n, 7): tx ty tz, qx qy qz qw."""
+        angles = self._rate * times_s[:, None, None] + self._phase
+        state = _CENTRE + _REACH * (np.sin(angles) @ _SHARES)
+        yaw, pitch, roll = (quaternion_exp(state[:, [k]] * axis) for k, axis in _TURNS.items())
+        # From the right: roll about the optical axis, pitch about the camera's x axis (positive
+        # looks up), the level camera that looks along world y, yaw about world z.
+        tilt = quaternion_multiply(pitch, roll)
+        rotation = quaternion_multiply(yaw, quaternion_multiply(_LEVEL, tilt))
+        return np.concatenate([state[:, :3], rotation], axis=1)
+
+    def photograph(self, frame: int, intrinsics: Intrinsics, size: tuple[int, int]) -> Image:
+        """Render a frame as this flight's camera sees it, shape (height, width, 3), BGR."""
+        time_s = frame * _FRAME_TIME_S
+        opening, pose, closing = self.poses(time_s + _EXPOSURE_S * np.array([-0.5, 0.0, 0.5]))
+        sharp = room().render(pose, intrinsics, size)
+        image = motion_blur(sharp, opening, pose, closing, intrinsics)
+        self._light.shade(image, time_s, intrinsics)
+        add_noise(image, self._rng(frame + 1))
+        return as_image(image)

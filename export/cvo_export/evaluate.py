@@ -1,0 +1,266 @@
+"""Coverage, width and error of a bundle on held-out frames, through the runtime, as users do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import betabinom
+
+from cvo_edge import geometry
+from cvo_edge.artifact import Calibration, Threshold, read_bundle
+from cvo_edge.conformal import conformal_rank, effective_sample_size, interval_score
+from cvo_edge.errors import GateError
+from cvo_edge.odometer import Odometer
+from cvo_export.calibrate import Observed, Rule, observe, thresholds
+from cvo_export.datasets import PoseDataset
+from cvo_export.splits import Split, same_split
+
+Array = NDArray[np.float64]
+Subset = Literal["test", "all"]
+
+# The band that a valid method's coverage stays in with this probability.
+_BAND_PROBABILITY = 0.99
+
+
+def evaluate(
+    bundle_dir: Path, dataset: PoseDataset, subset: Subset, threads: int | None = None
+) -> dict[str, Any]:
+    """Evaluate every stored confidence and scope; the report of ``cvo-export evaluate --json``.
+
+    ``test``: the frames that the run recorded as test, found again by the split in the bundle;
+    ``all``: every frame of a data set that the run has not seen. Frames that a check flags are left
+    out and counted. Where the run was split by sequence the other calibration rule is evaluated
+    beside the bundle's own.
+
+    Raises SourceError where the data set is not the one that was split.
+    """
+    bundle = read_bundle(bundle_dir)
+    calibration = bundle.calibration
+    recorded = calibration.calibration.split
+    first = calibration.thresholds[0]
+    split: Split | None = None
+    indices = np.arange(len(dataset))
+    if subset == "test":
+        split = same_split(dataset, recorded.kind, recorded.seed, recorded.sha256)
+        indices = split.roles["test"]
+    with Odometer(
+        bundle, threads=threads, confidence=first.confidence, scope=first.scope
+    ) as odometer:
+        seen = observe(odometer, dataset, indices)
+        sets = _Sets(odometer, seen, split is not None and split.kind == "random")
+        levels = [sets.level(entry) for entry in calibration.thresholds]
+        report = {
+            "bundle": calibration.name,
+            "method": calibration.method,
+            "dataset": dataset.name,
+            "subset": subset,
+            "split": recorded.kind,
+            "rule": calibration.calibration.rule,
+            "score": calibration.calibration.score,
+            "frames": {
+                "total": len(indices),
+                "bounded": sets.bounded,
+                "degraded": 0,
+                "invalid": seen.flagged,
+            },
+            "n_calibration": calibration.calibration.n,
+            "point_error": point_error(seen),
+            "levels": levels,
+            "sequences": sets.sequences(dataset),
+        }
+        if split is not None and split.kind == "sequence":
+            rule: Rule = (
+                "pooled" if calibration.calibration.rule == "hierarchical" else "hierarchical"
+            )
+            entries = _recalibrated(odometer, dataset, split, rule)
+            report["other_rule"] = {
+                "rule": rule,
+                "levels": [sets.level(entry) for entry in entries],
+            }
+    return report
+
+
+def point_error(seen: Observed) -> dict[str, float]:
+    """Median and 90 % quantile of position (m) and angle (deg) of the point estimate."""
+    distance = np.linalg.norm(seen.pose[:, :3] - seen.true_pose[:, :3], axis=1)
+    difference = geometry.quaternion_multiply(
+        geometry.quaternion_conjugate(seen.pose[:, 3:]), seen.true_pose[:, 3:]
+    )
+    angle = np.rad2deg(np.linalg.norm(geometry.quaternion_log(difference), axis=1))
+    return {
+        "median_m": float(np.median(distance)),
+        "median_deg": float(np.median(angle)),
+        "p90_m": float(np.quantile(distance, 0.9)),
+        "p90_deg": float(np.quantile(angle, 0.9)),
+    }
+
+
+def coverage_band(n_calibration: int, n_test: int, confidence: float) -> list[float] | None:
+    """Central 99 % of the coverage of ``n_test`` frames by an exchangeable calibration.
+
+    With n scores and rank k, coverage given the calibration is Beta(k, n + 1 - k), so the number
+    covered is Beta-binomial (Angelopoulos and Bates 2021, section 3.2). None where k > n: the set
+    is everything.
+    """
+    k = conformal_rank(n_calibration, confidence)
+    if k > n_calibration or n_test < 1:
+        return None
+    tail = 0.5 * (1.0 - _BAND_PROBABILITY)
+    covered = betabinom(n_test, k, n_calibration + 1 - k)
+    return [float(covered.ppf(tail) / n_test), float(covered.ppf(1.0 - tail) / n_test)]
+
+
+def check_coverage(report: Mapping[str, Any], least: float) -> None:
+    """Raise GateError where a DoF's marginal coverage at 0.9 is below ``least``."""
+    level = find_level(report["levels"], 0.9, "marginal")
+    worst = min(level["coverage"])
+    if not worst >= least:
+        raise GateError(f"evaluate: expected coverage of at least {least:g}, found {worst:.4f}")
+
+
+def find_level(levels: list[dict[str, Any]], confidence: float, scope: str) -> dict[str, Any]:
+    """Return the entry of a report's levels for this confidence and scope."""
+    return next(
+        level for level in levels if level["confidence"] == confidence and level["scope"] == scope
+    )
+
+
+def table(report: Mapping[str, Any]) -> list[str]:
+    """Return the report as lines of text for a person."""
+    error, frames = report["point_error"], report["frames"]
+    lines = [
+        f"{report['bundle']} ({report['method']}, {report['score']} score) on {report['dataset']}, "
+        f"{report['subset']} frames of a {report['split']} split",
+        f"frames {frames['total']}, invalid {frames['invalid']}; calibrated on "
+        f"{report['n_calibration']}",
+        f"point error  median {100 * error['median_m']:.2f} cm {error['median_deg']:.2f} deg, "
+        f"90 % {100 * error['p90_m']:.2f} cm {error['p90_deg']:.2f} deg",
+    ]
+    lines += _level_lines(report["rule"], report["levels"])
+    if "other_rule" in report:
+        lines += _level_lines(report["other_rule"]["rule"], report["other_rule"]["levels"])
+    if len(report["sequences"]) > 1:
+        lines += ["", f"{'sequence':<14}{'frames':>8}{'coverage at 0.9 per DoF':>44}{'joint':>10}"]
+        for name, entry in report["sequences"].items():
+            cells = "".join(f"{value:>8.2f}" for value in entry["coverage"])
+            lines.append(
+                f"{name:<14}{entry['frames']:>8}{cells:>48}{entry['joint_coverage']:>10.2f}"
+            )
+    return lines
+
+
+def _level_lines(rule: str, levels: list[dict[str, Any]]) -> list[str]:
+    lines = [
+        "",
+        f"{rule + ' rule':<20}{'coverage: tx ty tz, three rotations':^42}{'joint':>7}"
+        f"{'99 % band':>16}{'width cm':>10}{'deg':>7}{'score':>8}",
+    ]
+    for level in levels:
+        coverage = "".join(f"{value:>7.3f}" for value in level["coverage"])
+        band = level["coverage_band"]
+        shown = "unbounded" if band is None else f"{band[0]:.3f}-{band[1]:.3f}"
+        shown += " " if level["coverage_band_exact"] or band is None else "?"
+        width = np.array(level["median_width"])
+        lines.append(
+            f"{level['confidence']:<8g}{level['scope']:<12}{coverage}"
+            f"{level['joint_coverage']:>7.3f}{shown:>16}{100 * width[:3].mean():>10.2f}"
+            f"{np.rad2deg(width[3:].mean()):>7.2f}{level['normalised_interval_score']:>8.3f}"
+        )
+    if not all(level["coverage_band_exact"] for level in levels):
+        lines.append("? indicative: frames of one recording are no independent draws")
+    return lines
+
+
+def _recalibrated(
+    odometer: Odometer, dataset: PoseDataset, split: Split, rule: Rule
+) -> tuple[Threshold, ...]:
+    scores = []
+    for role in ("cal", "val"):
+        seen = observe(odometer, dataset, split.roles[role])
+        scores.append((odometer.head.scores(seen.outputs, seen.point, seen.truth), seen.sequence))
+    (cal_scores, cal_sequence), (val_scores, _) = scores
+    return thresholds(cal_scores, cal_sequence, val_scores, rule)
+
+
+@dataclass(frozen=True)
+class _Sets:
+    """The sets of all observed frames at any threshold."""
+
+    odometer: Odometer
+    seen: Observed
+    exact: bool
+
+    @property
+    def calibration(self) -> Calibration:
+        return self.odometer.calibration
+
+    @property
+    def bounded(self) -> int:
+        """Frames with finite bounds at the first threshold of all that has them."""
+        finite = [all(q is not None for q in t.q_hat) for t in self.calibration.thresholds]
+        return len(self.seen.indices) if any(finite) else 0
+
+    def inside(self, entry: Threshold) -> tuple[NDArray[np.bool_], Array, Array, NDArray[np.bool_]]:
+        """Covered (n, 6), width (n, 6), distance (n, 6) and boundedness (n,) of every frame."""
+        limits = self.calibration.pose.limits
+        lowest, highest = np.array(limits.lowest), np.array(limits.highest)
+        covered, width, distance, bounded = [], [], [], []
+        for row, truth in enumerate(self.seen.truth):
+            outputs = {name: values[row : row + 1] for name, values in self.seen.outputs.items()}
+            region = self.odometer.head.region(outputs, self.seen.point[row], entry)
+            bounded.append(np.isfinite(region.lower).all() and np.isfinite(region.upper).all())
+            covered.append(region.covers(truth))
+            limited = region.within(lowest, highest)
+            width.append(limited.width())
+            distance.append(limited.distance(truth))
+        return np.array(covered), np.array(width), np.array(distance), np.array(bounded)
+
+    def level(self, entry: Threshold) -> dict[str, Any]:
+        """Return the report's entry for one threshold."""
+        covered, width, distance, bounded = self.inside(entry)
+        n, n_test = self.calibration.calibration.n, len(covered)
+        score = interval_score(width, distance, 1.0 - entry.confidence)
+        deviation = np.array(self.calibration.pose.standard_deviation)
+        effective_test = effective_sample_size(score.mean(axis=1))
+        return {
+            "confidence": entry.confidence,
+            "scope": entry.scope,
+            "coverage": covered.mean(axis=0).tolist(),
+            "coverage_bounded": covered[bounded].mean(axis=0).tolist() if bounded.any() else None,
+            "coverage_band": coverage_band(n, n_test, entry.confidence),
+            "coverage_band_effective": coverage_band(
+                max(1, int(self.calibration.calibration.n_effective)),
+                max(1, int(effective_test)),
+                entry.confidence,
+            ),
+            "coverage_band_exact": self.exact,
+            "joint_coverage": float(covered.all(axis=1).mean()),
+            "mean_width": width.mean(axis=0).tolist(),
+            "median_width": np.median(width, axis=0).tolist(),
+            "interval_score": score.mean(axis=0).tolist(),
+            "normalised_interval_score": float((score.mean(axis=0) / deviation).mean()),
+            "unbounded_share": float(1.0 - bounded.mean()),
+        }
+
+    def sequences(self, dataset: PoseDataset) -> dict[str, dict[str, Any]]:
+        """Coverage of each sequence at 0.9, marginal thresholds and the joint ones."""
+        marginal = self.calibration.threshold(0.9, "marginal")
+        joint = self.calibration.threshold(0.9, "joint")
+        if marginal is None or joint is None:
+            return {}
+        covered = self.inside(marginal)[0]
+        jointly = self.inside(joint)[0].all(axis=1)
+        found = {}
+        for number in np.unique(self.seen.sequence):
+            rows = np.asarray(self.seen.sequence == number)
+            found[dataset.sequence_names[number]] = {
+                "frames": int(rows.sum()),
+                "coverage": covered[rows].mean(axis=0).tolist(),
+                "joint_coverage": float(jointly[rows].mean()),
+            }
+        return found

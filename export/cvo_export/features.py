@@ -1,0 +1,122 @@
+"""What the heads are trained on: cached features of augmented copies, or fresh images.
+
+The frozen network's features are computed by its own exported graph through the runtime: several
+times faster than torch on a CPU, and exactly what the device will compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cvo_edge import preprocess
+from cvo_edge.errors import UsageError
+from cvo_edge.session import Session
+from cvo_export.augment import AugmentConfig, augmented, model_intrinsics
+from cvo_export.backbone import Backbone
+from cvo_export.datasets import PoseDataset
+from cvo_export.to_onnx import export_onnx
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Progress = Callable[[str, int, int], None]
+
+
+class ModelImages:
+    """Frames of a data set as the model sees them: (height, width, 3) uint8 RGB, kept in memory."""
+
+    def __init__(
+        self,
+        dataset: PoseDataset,
+        indices: NDArray[np.int64],
+        height: int,
+        width: int,
+        crop: preprocess.Crop,
+    ) -> None:
+        self.poses = dataset.poses[indices]
+        self.images = np.empty((indices.size, height, width, 3), dtype=np.uint8)
+        self.K: Array | None = None
+        for row, index in enumerate(indices.tolist()):
+            image = preprocess.to_bgr8(dataset.read_image(index))
+            if image is None:
+                raise UsageError(f"{dataset.frame_names[index]}: expected a colour image")
+            self.images[row] = preprocess.model_input(image, height, width, crop)[0]
+            if self.K is None and dataset.intrinsics is not None:
+                self.K = model_intrinsics(dataset.intrinsics, image.shape, height, width, crop)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def augmented(
+        self, row: int, config: AugmentConfig, generator: np.random.Generator
+    ) -> tuple[Image, Array]:
+        """Return a changed copy of one image and its exact pose (7,)."""
+        return augmented(self.images[row], self.poses[row], self.K, config, generator)
+
+
+class FeatureExtractor:
+    """Images (height, width, 3) uint8 RGB -> features (size,), by the exported backbone."""
+
+    def __init__(self, backbone: Backbone, height: int, width: int) -> None:
+        blank = torch.zeros((1, height, width, 3), dtype=torch.uint8)
+        self._session = Session(export_onnx(backbone, [blank], ["image"], ["features"]))
+
+    def __call__(self, image: Image) -> NDArray[np.float32]:
+        """Return the features of one image."""
+        return np.asarray(self._session.run({"image": image[np.newaxis]})["features"][0])
+
+
+def cached_copies(
+    folder: Path,
+    images: ModelImages,
+    extractor: FeatureExtractor,
+    config: AugmentConfig,
+    copies: int,
+    seed: int,
+    progress: Progress,
+) -> tuple[NDArray[np.float16], Array]:
+    """Features (copies + 1, n, size) and poses (copies + 1, n, 7); the first is unchanged.
+
+    One file a copy, written whole or not at all, so that an interrupted run goes on with the next.
+    """
+    folder.mkdir(exist_ok=True)
+    features, poses = [], []
+    for number in range(copies + 1):
+        path = folder / f"copy-{number:03d}.npz"
+        if not path.is_file():
+            generator = np.random.default_rng((seed, number))
+            chosen = config if number else AugmentConfig(0.0, 0.0)
+            found = _one_copy(images, extractor, chosen, generator)
+            partial = path.with_suffix(".partial")
+            with partial.open("wb") as stream:
+                np.savez(stream, features=found[0], poses=found[1])
+            partial.replace(path)
+        with np.load(path) as stored:
+            features.append(stored["features"])
+            poses.append(stored["poses"])
+        progress("features", number + 1, copies + 1)
+    return np.stack(features), np.stack(poses)
+
+
+def _one_copy(
+    images: ModelImages,
+    extractor: FeatureExtractor,
+    config: AugmentConfig,
+    generator: np.random.Generator,
+) -> tuple[NDArray[np.float16], Array]:
+    features, poses = [], []
+    # The next image is changed while the network looks at this one.
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        pending = pool.submit(images.augmented, 0, config, generator)
+        for row in range(len(images)):
+            image, pose = pending.result()
+            if row + 1 < len(images):
+                pending = pool.submit(images.augmented, row + 1, config, generator)
+            features.append(extractor(image).astype(np.float16))
+            poses.append(pose)
+    return np.stack(features), np.stack(poses)

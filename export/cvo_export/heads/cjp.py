@@ -1,0 +1,183 @@
+"""Conformalized joint prediction: one variational network for the pose and both bounds.
+
+The paper's Fig. 3b and Eq. 4 to 6: pooled features -> encoder -> latent Gaussian -> decoder ->
+point m and bounds Q_l, Q_h of all six degrees of freedom, trained with one loss.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from scipy.stats import norm, qmc
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from cvo_export.losses import (
+    CombinedCalibrationLoss,
+    Gate,
+    IntervalForm,
+    interval_score_loss,
+    kl_divergence,
+)
+
+Latent = Literal["mean", "codebook", "sample"]
+Bounds = Literal["softplus", "free"]
+LATENTS: tuple[Latent, ...] = get_args(Latent)
+
+DOF = 6
+_CODEBOOK_SIZE = 16
+
+
+@dataclass(frozen=True)
+class CjpConfig:
+    """The choices of method and loss; the paper's are latent_size 3, gate literal, latent sample.
+
+    Attributes
+    ----------
+    latent_size
+        Dimension of the latent Gaussian; 3 is a bottleneck for six degrees of freedom.
+    latent
+        What inference draws: its ``mean``, the average over a fixed ``codebook`` of 16, or a
+        seeded ``sample``.
+    bounds
+        ``softplus``: distances below and above the point, so that they never cross; ``free``:
+        three free outputs, sorted.
+    hidden
+        Widths of the encoder's two layers, mirrored in the decoder.
+    sharpness
+        lambda of the combined calibration loss, 0 (calibration) to 1 (sharpness).
+    gate, interval_form
+        Variants of the loss, see ``cvo_export.losses``.
+    kl_weight
+        beta of the divergence from the standard Gaussian.
+    feature_noise
+        Standard deviation of Gaussian noise on the standardised features while training.
+    dropout
+        Dropout behind the encoder's and decoder's layers while training.
+    """
+
+    latent_size: int = 16
+    latent: Latent = "mean"
+    bounds: Bounds = "softplus"
+    hidden: tuple[int, int] = (256, 128)
+    sharpness: float = 0.5
+    gate: Gate = "corrected"
+    interval_form: IntervalForm = "proper"
+    kl_weight: float = 1e-3
+    feature_noise: float = 0.1
+    dropout: float = 0.0
+
+
+class CjpPrediction(NamedTuple):
+    """Standardised point and bounds (n, 6), and the latent Gaussian (n, latent_size)."""
+
+    point: Tensor
+    lower: Tensor
+    upper: Tensor
+    mu: Tensor
+    log_variance: Tensor
+
+
+class CjpNetwork(nn.Module):
+    """Features (n, size) -> CjpPrediction in standardised units."""
+
+    def __init__(self, size: int, config: CjpConfig) -> None:
+        super().__init__()
+        self.config = config
+        wide, narrow = config.hidden
+        self.register_buffer("feature_mean", torch.zeros(size))
+        self.register_buffer("feature_std", torch.ones(size))
+        self.feature_mean: Tensor
+        self.feature_std: Tensor
+        self.encoder = nn.Sequential(
+            *_layer(size, wide, config.dropout), *_layer(wide, narrow, config.dropout)
+        )
+        self.mu = nn.Linear(narrow, config.latent_size)
+        self.log_variance = nn.Linear(narrow, config.latent_size)
+        self.decoder = nn.Sequential(
+            *_layer(config.latent_size, narrow, config.dropout),
+            *_layer(narrow, wide, config.dropout),
+            nn.Linear(wide, 3 * DOF),
+        )
+
+    def encode(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (n, size) -> mean and log variance of the latent, (n, latent_size) each."""
+        x = (features - self.feature_mean) / self.feature_std
+        if self.training:
+            x = x + self.config.feature_noise * torch.randn_like(x)
+        hidden = self.encoder(x)
+        # Beyond +-10 a variance is zero or infinite in float32; early steps do go there.
+        return self.mu(hidden), self.log_variance(hidden).clamp(-10.0, 10.0)
+
+    def decode(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Latent (n, latent_size) -> point, lower, upper (n, 6), standardised."""
+        point, a, b = self.decoder(z).split(DOF, dim=1)
+        if self.config.bounds == "free":
+            return point, torch.minimum(a, b), torch.maximum(a, b)
+        return point, point - softplus(a), point + softplus(b)
+
+    def forward(self, features: Tensor, noise: Tensor | None = None) -> CjpPrediction:
+        """Features (n, size), latent noise (n, latent_size) or None for the latent's mean."""
+        mu, log_variance = self.encode(features)
+        z = mu if noise is None else mu + noise * torch.exp(0.5 * log_variance)
+        return CjpPrediction(*self.decode(z), mu, log_variance)
+
+
+class CjpLoss(nn.Module):
+    """Eq. 6: MSE + beta KL + INTSCORE + COMCAL, on standardised degrees of freedom."""
+
+    def __init__(self, config: CjpConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.combined_calibration = CombinedCalibrationLoss(DOF, config.sharpness, config.gate)
+
+    def forward(self, prediction: CjpPrediction, y: Tensor, warm_up: bool = False) -> Tensor:
+        """Prediction and truth (n, 6) -> scalar; during warm-up without the calibration term."""
+        point, lower, upper, mu, log_variance = prediction
+        loss = (
+            (point - y).square().mean()
+            + self.config.kl_weight * kl_divergence(mu, log_variance)
+            + interval_score_loss(lower, upper, y, self.config.interval_form)
+        )
+        # Running coverages must see the warm-up, too: they gate what comes after it.
+        combined = self.combined_calibration(lower, upper, y)
+        return loss if warm_up else loss + combined
+
+
+class CjpDecoded(nn.Module):
+    """Features -> point, lower, upper (n, 6), standardised, as inference draws the latent."""
+
+    def __init__(self, network: CjpNetwork) -> None:
+        super().__init__()
+        self.network = network
+        self.register_buffer("codebook", _codebook(network.config.latent_size))
+        self.codebook: Tensor
+
+    def forward(
+        self, features: Tensor, noise: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Features (n, size); noise (n, latent_size) in ``sample`` mode only."""
+        if self.network.config.latent != "codebook":
+            point, lower, upper, _, _ = self.network(features, noise)
+            return point, lower, upper
+        mu, log_variance = self.network.encode(features)
+        spread = torch.exp(0.5 * log_variance)
+        z = mu[:, None, :] + self.codebook * spread[:, None, :]
+        decoded = self.network.decode(z.flatten(0, 1))
+        point, lower, upper = (
+            values.reshape(-1, _CODEBOOK_SIZE, DOF).mean(dim=1) for values in decoded
+        )
+        return point, lower, upper
+
+
+def _layer(inputs: int, outputs: int, dropout: float) -> list[nn.Module]:
+    layer: list[nn.Module] = [nn.Linear(inputs, outputs), nn.PReLU(outputs)]
+    return [*layer, nn.Dropout(dropout)] if dropout > 0 else layer
+
+
+def _codebook(latent_size: int) -> Tensor:
+    """Fixed standard-normal points (16, latent_size) from a scrambled Sobol sequence."""
+    points = qmc.Sobol(latent_size, seed=0).random(_CODEBOOK_SIZE)
+    return torch.tensor(norm.ppf(points), dtype=torch.float32)

@@ -1,0 +1,193 @@
+"""Which frame has which role. No frame ever has two.
+
+``train`` fits the networks; ``fit`` is for models of residuals (CJP trains on train and fit
+together); ``val`` decides every choice (early stopping, score, scales); ``cal`` gives the
+thresholds and nothing else; ``test`` gives the final figures and nothing else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.errors import SourceError, UsageError
+from cvo_export.datasets import PoseDataset
+
+Kind = Literal["random", "block", "sequence"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+ROLES = ("train", "fit", "val", "cal", "test")
+SHARES = {"train": 0.4, "fit": 0.1, "val": 0.1, "cal": 0.2, "test": 0.2}
+
+_BLOCKS = 20
+# Frames dropped on the two sides of a border between blocks of different roles.
+_GAP_BEFORE, _GAP_AFTER = 7, 8
+_LEAST_SURVIVING = 0.6
+# Ten calibration sequences make the hierarchical rule finite at 0.9; one to spare.
+_CALIBRATION_SEQUENCES, _MANY_SEQUENCES = 11, 30
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Split:
+    """Frame numbers by role, ascending; frames of no role were dropped (gaps)."""
+
+    kind: Kind
+    seed: int
+    roles: Mapping[str, Indices]
+
+    def digest(self, dataset: PoseDataset) -> str:
+        """sha256 over the roles' frame names: the same split of the same frames, or not."""
+        text = json.dumps(self._names(dataset), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def write(self, path: Path, dataset: PoseDataset) -> None:
+        """Write kind, seed and the frame names of every role as JSON."""
+        document = {
+            "kind": self.kind,
+            "seed": self.seed,
+            "sha256": self.digest(dataset),
+            "roles": self._names(dataset),
+        }
+        path.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+
+    def _names(self, dataset: PoseDataset) -> dict[str, list[str]]:
+        return {
+            role: [dataset.frame_names[index] for index in indices]
+            for role, indices in self.roles.items()
+        }
+
+
+def make_split(dataset: PoseDataset, kind: Kind, seed: int) -> Split:
+    """Give every frame at most one role.
+
+    ``random``: frames, exchangeable by construction but flattering on video; ``block``: 20
+    contiguous blocks with gaps where roles change; ``sequence``: whole sequences, the data set's
+    own test list respected. The same data set, kind and seed give the same split.
+
+    Raises UsageError where the data set is too small for the kind.
+    """
+    generator = np.random.default_rng(seed)
+    if kind == "random":
+        roles = _random(dataset, generator)
+    elif kind == "block":
+        roles = _block(dataset, generator)
+    else:
+        roles = _sequence(dataset, generator)
+    empty = [role for role in ROLES if roles[role].size == 0]
+    if empty:
+        raise UsageError(
+            f"split {kind}: expected frames for every role, found none for {', '.join(empty)} "
+            f"among {len(dataset)} frames of {len(dataset.sequence_names)} sequence(s)"
+        )
+    return Split(kind, seed, roles)
+
+
+def default_kind(dataset: PoseDataset) -> Kind:
+    """Return ``sequence`` where there are enough sequences for the five roles, else ``block``."""
+    return "sequence" if len(dataset.sequence_names) >= len(ROLES) else "block"
+
+
+def same_split(dataset: PoseDataset, kind: Kind, seed: int, digest: str) -> Split:
+    """Make a recorded split again; raises SourceError where the data set is not the same."""
+    split = make_split(dataset, kind, seed)
+    found = split.digest(dataset)
+    if found != digest:
+        raise SourceError(
+            f"{dataset.name}: expected the frames of the recorded {kind} split {digest[:12]}..., "
+            f"found {found[:12]}...; is it another data set? --subset all needs no split"
+        )
+    return split
+
+
+def _counts(total: int, shares: Mapping[str, float]) -> dict[str, int]:
+    """Whole numbers that add up to ``total``, by largest remainder."""
+    exact = {role: total * share / sum(shares.values()) for role, share in shares.items()}
+    counts = {role: int(value) for role, value in exact.items()}
+    by_remainder = sorted(exact, key=lambda role: counts[role] - exact[role])
+    for role in by_remainder[: total - sum(counts.values())]:
+        counts[role] += 1
+    return counts
+
+
+def _deal(items: Indices, counts: Mapping[str, int]) -> dict[str, Indices]:
+    stops = np.cumsum(list(counts.values()))
+    return dict(zip(counts, np.split(items, stops[:-1]), strict=True))
+
+
+def _random(dataset: PoseDataset, generator: np.random.Generator) -> dict[str, Indices]:
+    shuffled = generator.permutation(len(dataset))
+    dealt = _deal(shuffled, _counts(len(dataset), SHARES))
+    return {role: np.sort(indices) for role, indices in dealt.items()}
+
+
+def _block(dataset: PoseDataset, generator: np.random.Generator) -> dict[str, Indices]:
+    blocks: list[Indices] = []
+    for number in range(len(dataset.sequence_names)):
+        frames = np.flatnonzero(dataset.sequence == number)
+        pieces = max(1, round(_BLOCKS * frames.size / len(dataset)))
+        blocks += [block for block in np.array_split(frames, pieces) if block.size]
+    dealt = _deal(generator.permutation(len(blocks)), _counts(len(blocks), SHARES))
+    role_of = {int(block): role for role, members in dealt.items() for block in members}
+    roles: dict[str, list[Indices]] = {role: [] for role in ROLES}
+    for index, block in enumerate(blocks):
+        start = _GAP_AFTER if _border(dataset, blocks, role_of, index - 1) else 0
+        stop = block.size - (_GAP_BEFORE if _border(dataset, blocks, role_of, index) else 0)
+        roles[role_of[index]].append(block[start : max(start, stop)])
+    surviving = sum(part.size for parts in roles.values() for part in parts)
+    if surviving < _LEAST_SURVIVING * len(dataset):
+        raise UsageError(
+            f"split block: expected at least {_LEAST_SURVIVING:.0%} of the frames to survive the "
+            f"gaps, found {surviving} of {len(dataset)}; the recording is too short"
+        )
+    empty = np.empty(0, np.int64)
+    return {role: np.concatenate(parts) if parts else empty for role, parts in roles.items()}
+
+
+def _border(
+    dataset: PoseDataset, blocks: list[Indices], role_of: Mapping[int, str], index: int
+) -> bool:
+    """Whether blocks ``index`` and ``index + 1`` touch in time and have different roles."""
+    if not 0 <= index < len(blocks) - 1:
+        return False
+    same = dataset.sequence[blocks[index][0]] == dataset.sequence[blocks[index + 1][0]]
+    return bool(same) and role_of[index] != role_of[index + 1]
+
+
+def _sequence(dataset: PoseDataset, generator: np.random.Generator) -> dict[str, Indices]:
+    everything = range(len(dataset.sequence_names))
+    test = np.array(sorted(dataset.own_test), dtype=np.int64)
+    pool = sorted(dataset.own_train or set(everything) - dataset.own_test)
+    shuffled = generator.permutation(np.array(pool, dtype=np.int64))
+    shares = dict(SHARES)
+    if test.size:
+        del shares["test"]
+    counts = _counts(shuffled.size, shares)
+    if len(everything) >= _MANY_SEQUENCES:
+        counts = _more_calibration(counts)
+    dealt = _deal(shuffled, counts)
+    if test.size:
+        dealt["test"] = test
+    return {
+        role: np.flatnonzero(np.isin(dataset.sequence, dealt[role])).astype(np.int64)
+        for role in ROLES
+    }
+
+
+def _more_calibration(counts: Mapping[str, int]) -> dict[str, int]:
+    """Enough calibration sequences for the hierarchical rule, taken from fit and val in turn."""
+    changed = dict(counts)
+    for _ in range(2 * _CALIBRATION_SEQUENCES):
+        donor = max(("val", "fit"), key=lambda role: changed[role])
+        if changed["cal"] >= _CALIBRATION_SEQUENCES or changed[donor] <= 1:
+            break
+        changed[donor] -= 1
+        changed["cal"] += 1
+    return changed
