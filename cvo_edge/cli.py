@@ -40,6 +40,7 @@ class FormatName(StrEnum):
     JSONL = "jsonl"
     CSV = "csv"
     TUM = "tum"
+    TABLE = "table"
 
 
 BundleArgument = Annotated[

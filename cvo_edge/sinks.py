@@ -1,9 +1,10 @@
-"""Where estimates go: JSON lines, CSV or a TUM trajectory, one whole flushed line a frame."""
+"""Where estimates go: JSON lines, CSV, a TUM trajectory or a table, one flushed line a frame."""
 
 from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import sys
 from collections.abc import Callable, Iterable
@@ -16,7 +17,7 @@ import msgspec
 from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.pose import PoseInterval
 
-Format = Literal["jsonl", "csv", "tum"]
+Format = Literal["jsonl", "csv", "tum", "table"]
 
 _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
 
@@ -29,7 +30,7 @@ class Sink:
     path
         Output file, replaced if it exists, or ``-`` for standard output.
     format
-        ``jsonl``, ``csv`` or ``tum``.
+        ``jsonl``, ``csv``, ``tum`` or, for reading by eye, ``table``.
 
     Raises
     ------
@@ -156,9 +157,34 @@ def _tum_line(estimate: PoseInterval) -> bytes:
     return f"{seconds}.{rest:09d} {numbers}\n".encode()
 
 
+def _table_header(estimate: PoseInterval) -> bytes:
+    names = "".join(
+        f"{name + unit:>18}" for name, unit in zip(estimate.chart.dof, _UNITS, strict=True)
+    )
+    return f"{'frame':<26}{'status':<9}{names}\n".encode()
+
+
+def _table_line(estimate: PoseInterval) -> bytes:
+    name = (estimate.source or str(estimate.seq))[-25:]
+    line = f"{name:<26}{estimate.status:<9}"
+    if estimate.pose is None:
+        return f"{line}  {', '.join(estimate.reasons)}\n".encode()
+    for low, high, scale in zip(
+        estimate.lower.tolist(), estimate.upper.tolist(), _SCALES, strict=True
+    ):
+        finite = high - low < float("inf")
+        cell = f"{scale * low:.1f} .. {scale * high:.1f}" if finite else "unbounded"
+        line += f"{cell:>18}"
+    return f"{line}\n".encode()
+
+
+_UNITS = (" cm",) * 3 + (" deg",) * 3
+_SCALES = (100.0,) * 3 + (math.degrees(1.0),) * 3
+
 _LineWriter = Callable[[PoseInterval], bytes]
 _FORMATS: dict[Format, tuple[_LineWriter | None, _LineWriter]] = {
     "jsonl": (None, _json_line),
     "csv": (_csv_header, _csv_line),
     "tum": (None, _tum_line),
+    "table": (_table_header, _table_line),
 }

@@ -8,9 +8,10 @@ costs a quarter of the parameters; that mean stays selectable as stage ``final``
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import timm
@@ -171,11 +172,11 @@ def load_weights(backbone: Backbone, weights: str) -> str | None:
     return sha256
 
 
-def _mean_std(body: Any, normalisation: Normalisation) -> tuple[list[float], list[float]]:
+def _mean_std(body: nn.Module, normalisation: Normalisation) -> tuple[list[float], list[float]]:
     if normalisation == "half":
         return [0.5] * 3, [0.5] * 3
-    config = body.pretrained_cfg
-    return [float(v) for v in config["mean"]], [float(v) for v in config["std"]]
+    config = cast("Mapping[str, Sequence[float]]", body.pretrained_cfg)
+    return list(config["mean"]), list(config["std"])
 
 
 def _averaging(size: int, cells: int) -> Tensor:

@@ -212,7 +212,7 @@ def publish(
     """Export a run to ONNX, calibrate that graph and write its bundle."""
     from cvo_edge.describe import inspect_lines
     from cvo_export.publish import publish as publish_run
-    from cvo_export.train import load_run
+    from cvo_export.run import load_run
 
     run = load_run(run_dir, dataset)
     calibration = publish_run(

@@ -11,8 +11,8 @@ from cvo_export.augment import AugmentConfig
 from cvo_export.backbone import NO_WEIGHTS, TIMM_WEIGHTS, BackboneConfig, Normalisation
 from cvo_export.datasets import open_dataset
 from cvo_export.heads.cjp import CjpConfig
+from cvo_export.run import TrainConfig
 from cvo_export.splits import Kind, default_kind
-from cvo_export.train import TrainConfig
 
 
 def configure(

@@ -256,10 +256,10 @@ class _Sets:
         covered = self.inside(marginal)[0]
         jointly = self.inside(joint)[0].all(axis=1)
         found = {}
-        for number in np.unique(self.seen.sequence):
-            rows = np.asarray(self.seen.sequence == number)
+        for number in np.unique(self.seen.sequence).tolist():
+            rows = np.flatnonzero(np.equal(self.seen.sequence, number))
             found[dataset.sequence_names[number]] = {
-                "frames": int(rows.sum()),
+                "frames": int(rows.size),
                 "coverage": covered[rows].mean(axis=0).tolist(),
                 "joint_coverage": float(jointly[rows].mean()),
             }

@@ -23,8 +23,8 @@ from cvo_edge.odometer import Odometer
 from cvo_edge.selftest import check_selftest, observe_selftest
 from cvo_edge.session import Session
 from cvo_export.calibrate import CONFIDENCES, Observed, Rule, effective_frames, observe, thresholds
+from cvo_export.run import Run
 from cvo_export.to_onnx import OPSET, check_parity, export_onnx
-from cvo_export.train import Run
 
 Array = NDArray[np.float64]
 

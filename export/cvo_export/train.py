@@ -1,190 +1,43 @@
-"""One training loop: data set, split, features, steps, early stopping, checkpoints.
+"""One training loop: features, steps, early stopping on val, checkpoints.
 
-The run folder holds everything that publishing needs: ``config.json``, ``split.json``, cached
-features, ``checkpoint.pt`` (to go on after an interruption) and, in the end, ``network.pt``.
+Every random draw is a function of (seed, phase, step), so that an interrupted run that goes on ends
+with the same numbers as one that was never interrupted.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, cast
 
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from cvo_edge import geometry
 from cvo_edge.conformal import conformal_quantile, interval_score
-from cvo_edge.errors import UsageError
-from cvo_edge.pose import Chart
-from cvo_edge.preprocess import Crop
-from cvo_export.augment import AugmentConfig
-from cvo_export.backbone import Backbone, BackboneConfig, load_weights
-from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.backbone import Backbone, load_weights
 from cvo_export.features import FeatureExtractor, ModelImages, Progress, cached_copies
-from cvo_export.heads.cjp import CjpConfig, CjpDecoded, CjpLoss, CjpNetwork
-from cvo_export.splits import Kind, Split, make_split, same_split
+from cvo_export.heads.cjp import CjpDecoded, CjpLoss, CjpNetwork
+from cvo_export.run import Run, TrainConfig, open_run
+from cvo_export.target import PoseGraph, Target, fit_target
 
 Array = NDArray[np.float64]
+Batch = Callable[[np.random.Generator], tuple[Tensor, Tensor]]
 
-CONFIG_FILE = "config.json"
-SPLIT_FILE = "split.json"
 CHECKPOINT_FILE = "checkpoint.pt"
-NETWORK_FILE = "network.pt"
 FEATURES_FOLDER = "features"
 
-# Beyond this spread about the mean rotation the tangent at it comes near its cut at pi.
-MAX_SPREAD_RAD = 2.0
-# Share of the steps after which no new best on val ends the training.
-_PATIENCE = 0.4
+# Evaluations on val in a phase, and how many without a new best end it. The learning rate falls as
+# a cosine, so most of the gain comes late: patience is long.
+_EVALUATIONS = 40
+_PATIENCE = 20
 
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Everything that decides a run; written to ``config.json``.
-
-    ``split`` None takes ``sequence`` where the data set has enough of them, else ``block``;
-    ``copies`` is the number of augmented copies of each training frame whose features are cached;
-    ``steps``, ``batch_size``, ``learning_rate`` and ``weight_decay`` are AdamW's; the rate rises
-    over 50 steps and falls as a cosine. ``fine_tune`` more steps train the whole network on
-    fresh augmented images at ``backbone_learning_rate``.
-    """
-
-    method: Literal["cjp"]
-    dataset: str
-    split: Kind
-    seed: int = 0
-    height: int = 192
-    width: int = 256
-    crop: Crop = "none"
-    backbone: BackboneConfig = field(default_factory=BackboneConfig)
-    weights: str = "timm"
-    augment: AugmentConfig = field(default_factory=AugmentConfig)
-    copies: int = 12
-    head: CjpConfig = field(default_factory=CjpConfig)
-    steps: int = 4000
-    warm_up_steps: int = 200
-    batch_size: int = 64
-    learning_rate: float = 1e-3
-    weight_decay: float = 1e-3
-    averaging: float = 0.995
-
-
-@dataclass(frozen=True)
-class Target:
-    """Standardised degrees of freedom: tx ty tz and Log(R_reference^T R), over train and fit."""
-
-    reference_q_xyzw: Array
-    mean: Array
-    std: Array
-
-    @property
-    def chart(self) -> Chart:
-        """The chart whose coordinates are standardised."""
-        return Chart("tangent_reference", self.reference_q_xyzw)
-
-    def coordinates(self, poses: Array) -> Array:
-        """Poses (..., 7) -> coordinates (..., 6), m and rad."""
-        return self.chart.coordinates(poses, poses)
-
-    def standardised(self, poses: Array) -> Array:
-        """Poses (..., 7) -> numbers (..., 6) of mean 0 and deviation 1 over train and fit."""
-        return (self.coordinates(poses) - self.mean) / self.std
-
-
-def fit_target(poses: Array) -> Target:
-    """Mean rotation, mean and deviation of training poses (n, 7); raises UsageError if too wide."""
-    reference = geometry.mean_rotation(poses[:, 3:])
-    coordinates = Chart("tangent_reference", reference).coordinates(poses, poses)
-    spread = float(np.linalg.norm(coordinates[:, 3:], axis=1).max())
-    if spread > MAX_SPREAD_RAD:
-        raise UsageError(
-            f"poses: expected rotations within {MAX_SPREAD_RAD:g} rad of their mean, found one at "
-            f"{spread:.2f} rad; the tangent at one reference cannot hold a full turn"
-        )
-    deviation = coordinates.std(axis=0)
-    if not (deviation > 1e-6).all():
-        raise UsageError(
-            f"poses: expected motion in every degree of freedom, found standard deviations "
-            f"{deviation.tolist()}"
-        )
-    return Target(reference, coordinates.mean(axis=0), deviation)
-
-
-class PoseGraph(nn.Module):
-    """What is exported: images (n, height, width, 3) -> pose (n, 7), lower and upper (n, 6)."""
-
-    def __init__(self, backbone: Backbone, network: CjpNetwork, target: Target) -> None:
-        super().__init__()
-        self.backbone = backbone
-        self.decoded = CjpDecoded(network)
-        self.register_buffer("mean", torch.tensor(target.mean, dtype=torch.float32))
-        self.register_buffer("std", torch.tensor(target.std, dtype=torch.float32))
-        reference = torch.tensor(target.reference_q_xyzw, dtype=torch.float32)
-        self.register_buffer("reference", reference)
-        self.mean: Tensor
-        self.std: Tensor
-        self.reference: Tensor
-
-    def forward(self, image: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return pose, lower and upper in metres and radians."""
-        point, lower, upper = (
-            values * self.std + self.mean for values in self.decoded(self.backbone(image), noise)
-        )
-        q_xyzw = _multiply(self.reference, _exp(point[:, 3:]))
-        return torch.cat([point[:, :3], q_xyzw], dim=1), lower, upper
-
-
-def _exp(rotvec: Tensor) -> Tensor:
-    """Rotation vectors (n, 3) -> quaternions (n, 4); 1e-12 keeps the quotient at zero finite."""
-    angle = (rotvec.square().sum(dim=1, keepdim=True) + 1e-12).sqrt()
-    return torch.cat([rotvec * (torch.sin(0.5 * angle) / angle), torch.cos(0.5 * angle)], dim=1)
-
-
-def _multiply(p: Tensor, q: Tensor) -> Tensor:
-    """Hamilton product of one quaternion (4,) with many (n, 4), as a constant matrix."""
-    x, y, z, w = p
-    left = torch.stack(
-        [
-            torch.stack([w, -z, y, x]),
-            torch.stack([z, w, -x, y]),
-            torch.stack([-y, x, w, z]),
-            torch.stack([-x, -y, -z, w]),
-        ]
-    )
-    return q @ left.T
-
-
-@dataclass(frozen=True)
-class Run:
-    """A finished run: what it was asked for and what it learned."""
-
-    config: TrainConfig
-    dataset: PoseDataset
-    split: Split
-    target: Target
-    graph: PoseGraph
-    weights_sha256: str | None
-    history: list[dict[str, float]]
-
-    def lines(self) -> list[str]:
-        """Return what was trained as lines of text for a person."""
-        counts = ", ".join(f"{role} {indices.size}" for role, indices in self.split.roles.items())
-        skipped = ", ".join(f"{count} {reason}" for reason, count in self.dataset.skipped.items())
-        best = min(self.history, key=lambda entry: entry["val_score"])
-        parameters = sum(parameter.numel() for parameter in self.graph.parameters())
-        return [
-            f"data set    {self.dataset.name}: {len(self.dataset)} frames, {skipped or 'none'} "
-            "skipped",
-            f"split       {self.split.kind}: {counts}",
-            f"network     {self.config.backbone.name}, {parameters / 1e6:.2f} M parameters",
-            f"best        val score {best['val_score']:.3f} at step {best['step']:.0f}",
-        ]
+# An image costs the backbone a hundred times what its features cost the head.
+_IMAGE_BATCH = 16
 
 
 def train(run_dir: Path, config: TrainConfig, progress: Progress) -> Run:
@@ -192,153 +45,230 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress) -> Run:
 
     Raises UsageError where ``run_dir`` holds another configuration.
     """
-    run_dir.mkdir(parents=True, exist_ok=True)
-    _claim(run_dir, config)
-    dataset = open_dataset(config.dataset)
-    split = make_split(dataset, config.split, config.seed)
-    split.write(run_dir / SPLIT_FILE, dataset)
+    dataset, split = open_run(run_dir, config)
     torch.manual_seed(config.seed)
-    backbone, weights_sha256 = _backbone(config)
-    training = np.concatenate([split.roles["train"], split.roles["fit"]])
-    target = fit_target(dataset.poses[training])
-    extractor = FeatureExtractor(backbone, config.height, config.width)
-    features, poses = cached_copies(
-        run_dir / FEATURES_FOLDER,
-        ModelImages(dataset, training, config.height, config.width, config.crop),
-        extractor,
-        config.augment,
-        config.copies,
-        config.seed,
-        progress,
-    )
-    val_images = ModelImages(dataset, split.roles["val"], config.height, config.width, config.crop)
-    val_features = np.stack([extractor(image) for image in val_images.images])
-    network = CjpNetwork(backbone.size, config.head)
-    network.feature_mean.copy_(torch.from_numpy(features.mean((0, 1), dtype=np.float64)))
-    # A feature that is nearly always zero would be blown up where it is not.
-    deviation = features.std((0, 1), dtype=np.float64)
-    network.feature_std.copy_(torch.from_numpy(deviation + 0.1 * deviation.mean()))
-    history = _fit_head(
-        run_dir / CHECKPOINT_FILE,
+    backbone = Backbone(config.backbone, config.height, config.width)
+    weights_sha256 = load_weights(backbone, config.weights)
+    indices = np.concatenate([split.roles["train"], split.roles["fit"]])
+    target = fit_target(dataset.poses[indices])
+    size = (config.height, config.width, config.crop)
+    trainer = _Trainer(
+        run_dir,
         config,
-        network,
-        (torch.from_numpy(features), torch.tensor(target.standardised(poses), dtype=torch.float32)),
-        (torch.from_numpy(val_features), target.standardised(val_images.poses)),
+        backbone,
+        CjpNetwork(backbone.size, config.head),
+        target,
+        ModelImages(dataset, indices, *size),
+        ModelImages(dataset, split.roles["val"], *size),
         progress,
     )
-    graph = PoseGraph(backbone, network, target).eval()
-    torch.save(
-        {
-            "graph": graph.state_dict(),
-            "target": [
-                torch.from_numpy(v) for v in (target.reference_q_xyzw, target.mean, target.std)
-            ],
-            "weights_sha256": weights_sha256,
-            "history": history,
-        },
-        run_dir / NETWORK_FILE,
-    )
-    return Run(config, dataset, split, target, graph, weights_sha256, history)
+    history = trainer.fit()
+    graph = PoseGraph(backbone, trainer.network, target).eval()
+    run = Run(config, dataset, split, target, graph, weights_sha256, history)
+    run.save(run_dir)
+    return run
 
 
-def load_run(run_dir: Path, dataset: str | None = None) -> Run:
-    """Read a finished run; ``dataset`` says where its data set is now, if it has moved.
+@dataclass
+class _Trainer:
+    """The phases of a run: the head on cached features; with fine-tuning all, then it again."""
 
-    Raises UsageError where the folder holds no finished run, SourceError where the data set is not
-    the one that was split.
-    """
-    path = run_dir / NETWORK_FILE
-    if not path.is_file():
-        raise UsageError(f"{run_dir}: expected a finished run, found no {NETWORK_FILE}")
-    config = msgspec.json.decode((run_dir / CONFIG_FILE).read_bytes(), type=TrainConfig)
-    recorded = msgspec.json.decode((run_dir / SPLIT_FILE).read_bytes())
-    opened = open_dataset(dataset or config.dataset)
-    split = same_split(opened, config.split, config.seed, recorded["sha256"])
-    stored = torch.load(path, weights_only=True)
-    target = Target(*(values.numpy() for values in stored["target"]))
-    backbone = Backbone(config.backbone, config.height, config.width)
-    graph = PoseGraph(backbone, CjpNetwork(backbone.size, config.head), target).eval()
-    graph.load_state_dict(stored["graph"])
-    return Run(config, opened, split, target, graph, stored["weights_sha256"], stored["history"])
+    run_dir: Path
+    config: TrainConfig
+    backbone: Backbone
+    network: CjpNetwork
+    target: Target
+    images: ModelImages
+    val_images: ModelImages
+    progress: Progress
 
+    def fit(self) -> list[dict[str, float]]:
+        """Run all phases, from the checkpoint if there is one; returns the history."""
+        self.both = nn.ModuleDict({"backbone": self.backbone, "network": self.network})
+        self.loss = CjpLoss(self.config.head)
+        self.history: list[dict[str, float]] = []
+        self.val_y = self.target.standardised(self.val_images.poses)
+        checkpoint = self._read_checkpoint()
+        first = checkpoint["phase"] if checkpoint else 0
+        for phase in range(first, 3 if self.config.fine_tune else 1):
+            state = checkpoint if checkpoint and phase == first else None
+            if phase == 1:
+                self._fit_all(phase, state)
+            else:
+                self._fit_head(phase, state)
+        return self.history
 
-def _backbone(config: TrainConfig) -> tuple[Backbone, str | None]:
-    backbone = Backbone(config.backbone, config.height, config.width)
-    return backbone, load_weights(backbone, config.weights)
-
-
-def _claim(run_dir: Path, config: TrainConfig) -> None:
-    """Write the configuration, or refuse a folder that belongs to another one."""
-    path = run_dir / CONFIG_FILE
-    content = msgspec.json.format(msgspec.json.encode(config), indent=1)
-    if not path.exists():
-        path.write_bytes(content)
-    elif path.read_bytes() != content:
-        raise UsageError(
-            f"{run_dir}: expected a new folder or a run of the same options, found another run"
+    def _fit_head(self, phase: int, state: dict[str, Any] | None) -> None:
+        """Train the head on features of augmented copies, computed by the present backbone."""
+        extractor = FeatureExtractor(self.backbone, self.config.height, self.config.width)
+        features, poses = cached_copies(
+            self.run_dir / f"{FEATURES_FOLDER}-{phase}",
+            self.images,
+            extractor,
+            self.config.augment,
+            self.config.copies,
+            self.config.seed,
+            self.progress,
         )
+        val = torch.from_numpy(np.stack([extractor(image) for image in self.val_images.images]))
+        if phase == 0:
+            self._standardise(features)
+        x = torch.from_numpy(features)
+        y = torch.tensor(self.target.standardised(poses), dtype=torch.float32)
 
+        def batch(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
+            copy = generator.integers(x.shape[0], size=self.config.batch_size)
+            frame = generator.integers(x.shape[1], size=self.config.batch_size)
+            return x[copy, frame].float(), y[copy, frame]
 
-def _fit_head(
-    checkpoint: Path,
-    config: TrainConfig,
-    network: CjpNetwork,
-    training: tuple[Tensor, Tensor],
-    val: tuple[Tensor, Array],
-    progress: Progress,
-) -> list[dict[str, float]]:
-    """Train on cached copies; leaves the weights that were best on val in ``network``."""
-    features, y = training
-    copies, frames = features.shape[:2]
-    loss = CjpLoss(config.head)
-    optimiser = torch.optim.AdamW(
-        network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
-    )
-    averaging = get_ema_multi_avg_fn(config.averaging)  # type: ignore[no-untyped-call]
-    averaged = AveragedModel(network, multi_avg_fn=averaging)
-    generator = torch.Generator().manual_seed(config.seed)
-    every = max(1, config.steps // 40)
-    history: list[dict[str, float]] = []
-    best = math.inf
-    start = 0
-    network.train()
-    loss.train()
-    for step in range(start, config.steps):
-        rate = config.learning_rate * _schedule(step, config.steps)
-        for group in optimiser.param_groups:
-            group["lr"] = rate
-        copy = torch.randint(copies, (config.batch_size,), generator=generator)
-        frame = torch.randint(frames, (config.batch_size,), generator=generator)
-        mu_noise = torch.randn(config.batch_size, config.head.latent_size)
-        prediction = network(features[copy, frame].float(), mu_noise)
-        value = loss(prediction, y[copy, frame], warm_up=step < config.warm_up_steps)
-        optimiser.zero_grad()
-        value.backward()
-        optimiser.step()
-        averaged.update_parameters(network)
-        if (step + 1) % every == 0:
-            score = _val_score(averaged.module, val)
-            history.append({"step": step + 1, "loss": value.item(), "val_score": score})
-            progress(f"training, val score {score:.3f}", step + 1, config.steps)
-            if score < best:
-                best = score
-                kept = {k: v.clone() for k, v in averaged.module.state_dict().items()}
-    network.load_state_dict(kept)
-    return history
+        groups = [{"params": list(self.network.parameters()), "peak": self.config.learning_rate}]
+        self._loop(phase, "head", groups, self.config.steps, batch, lambda _: val, state)
+
+    def _fit_all(self, phase: int, state: dict[str, Any] | None) -> None:
+        """Train backbone and head together on fresh augmented images."""
+        # Batch statistics of 16 images are too noisy: the running ones stay.
+        self.backbone.eval()
+
+        def batch(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
+            rows = generator.integers(len(self.images), size=_IMAGE_BATCH)
+            drawn = [
+                self.images.augmented(row, self.config.augment, generator) for row in rows.tolist()
+            ]
+            y = self.target.standardised(np.stack([pose for _, pose in drawn]))
+            stacked = torch.from_numpy(np.stack([image for image, _ in drawn]))
+            return self.backbone(stacked), torch.tensor(y, dtype=torch.float32)
+
+        def val_features(averaged: nn.Module) -> Tensor:
+            with torch.no_grad():
+                backbone = averaged.get_submodule("backbone")
+                images = torch.from_numpy(self.val_images.images)
+                starts = range(0, len(images), _IMAGE_BATCH)
+                return torch.cat([backbone(images[i : i + _IMAGE_BATCH]) for i in starts])
+
+        groups = [
+            # The head is trained already: a full rate would undo it.
+            {"params": list(self.network.parameters()), "peak": 0.3 * self.config.learning_rate},
+            {
+                "params": list(self.backbone.parameters()),
+                "peak": self.config.backbone_learning_rate,
+            },
+        ]
+        steps = self.config.fine_tune * math.ceil(len(self.images) / _IMAGE_BATCH)
+        self._loop(phase, "fine-tuning", groups, steps, batch, val_features, state)
+
+    def _loop(
+        self,
+        phase: int,
+        name: str,
+        groups: list[dict[str, Any]],
+        steps: int,
+        batch: Batch,
+        val_features: Callable[[nn.Module], Tensor],
+        state: dict[str, Any] | None,
+    ) -> None:
+        """Run one phase; ``both`` ends with the averaged weights that were best on val."""
+        config = self.config
+        optimiser = torch.optim.AdamW(groups, weight_decay=config.weight_decay)
+        averaging = get_ema_multi_avg_fn(config.averaging)  # type: ignore[no-untyped-call]
+        averaged = AveragedModel(self.both, multi_avg_fn=averaging)
+        best: dict[str, Any] = {"score": math.inf, "weights": self.both.state_dict(), "count": 0}
+        start = 0
+        if state is not None:
+            optimiser.load_state_dict(state["optimiser"])
+            averaged.load_state_dict(state["averaged"])
+            best, start = state["best"], state["step"]
+            torch.set_rng_state(state["torch_rng"])
+        every = max(1, steps // _EVALUATIONS)
+        for step in range(start, steps):
+            if best["count"] >= _PATIENCE:
+                break
+            for group in optimiser.param_groups:
+                group["lr"] = group["peak"] * _schedule(step, steps)
+            self.network.train()
+            self.loss.train()
+            features, y = batch(np.random.default_rng((config.seed, phase, step)))
+            noise = torch.randn(len(y), config.head.latent_size)
+            prediction = self.network(features, noise)
+            warm_up = phase == 0 and step < config.warm_up_steps
+            value = self.loss(prediction, y, warm_up=warm_up)
+            optimiser.zero_grad()
+            value.backward()
+            optimiser.step()
+            averaged.update_parameters(self.both)
+            if (step + 1) % every == 0 or step + 1 == steps:
+                module = averaged.module
+                head = module.get_submodule("network")
+                score = val_score(cast("CjpNetwork", head), val_features(module), self.val_y)
+                if score < best["score"]:
+                    weights = {key: value.clone() for key, value in module.state_dict().items()}
+                    best = {"score": score, "weights": weights, "count": 0}
+                else:
+                    best["count"] += 1
+                entry = {"phase": phase, "step": step + 1, "loss": value.item()}
+                self.history.append({**entry, "val_score": score})
+                self._write_checkpoint(phase, step + 1, optimiser, averaged, best)
+                self.progress(f"{name}, val score {score:.3f}", step + 1, steps)
+        self.both.load_state_dict(best["weights"])
+        self.network.eval()
+
+    def _standardise(self, features: NDArray[np.float16]) -> None:
+        deviation = features.std((0, 1), dtype=np.float64)
+        self.network.feature_mean.copy_(torch.from_numpy(features.mean((0, 1), dtype=np.float64)))
+        # A feature that is nearly always zero would be blown up where it is not.
+        self.network.feature_std.copy_(torch.from_numpy(deviation + 0.1 * deviation.mean()))
+
+    def _write_checkpoint(
+        self,
+        phase: int,
+        step: int,
+        optimiser: torch.optim.Optimizer,
+        averaged: AveragedModel,
+        best: dict[str, Any],
+    ) -> None:
+        path = self.run_dir / CHECKPOINT_FILE
+        partial = path.with_suffix(".partial")
+        torch.save(
+            {
+                "phase": phase,
+                "step": step,
+                "weights": self.both.state_dict(),
+                "loss": self.loss.state_dict(),
+                "optimiser": optimiser.state_dict(),
+                "averaged": averaged.state_dict(),
+                "best": best,
+                "history": self.history,
+                "torch_rng": torch.get_rng_state(),
+            },
+            partial,
+        )
+        partial.replace(path)
+
+    def _read_checkpoint(self) -> dict[str, Any] | None:
+        path = self.run_dir / CHECKPOINT_FILE
+        if not path.is_file():
+            return None
+        state: dict[str, Any] = torch.load(path, weights_only=True)
+        self.both.load_state_dict(state["weights"])
+        self.loss.load_state_dict(state["loss"])
+        self.history = state["history"]
+        return state
 
 
 def _schedule(step: int, steps: int) -> float:
     return min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
 
-def _val_score(network: CjpNetwork, val: tuple[Tensor, Array]) -> float:
-    """Mean interval score at 90 % of the bounds, conformalised on val itself."""
-    features, y = val
+def val_score(network: CjpNetwork, features: Tensor, y: Array) -> float:
+    """Mean interval score at 90 % on val (n, 6), standardised, bounds conformalised on val itself.
+
+    What the finished bundle will be judged by, as far as val can say it.
+    """
     network.eval()
     with torch.no_grad():
-        _, lower, upper = (v.numpy().astype(np.float64) for v in CjpDecoded(network)(features))
+        found = CjpDecoded(network)(features)
+    _, lower, upper = (values.numpy().astype(np.float64) for values in found)
     scores = np.maximum(lower - y, y - upper)
-    q = np.array([conformal_quantile(scores[:, d], 0.9) for d in range(6)])
-    lower, upper = lower - q, upper + q
+    q_hat = np.array([conformal_quantile(scores[:, dof], 0.9) for dof in range(6)])
+    lower, upper = lower - q_hat, upper + q_hat
     distance = np.maximum(np.maximum(lower - y, y - upper), 0.0)
     return float(interval_score(upper - lower, distance, 0.1).mean())

@@ -30,6 +30,7 @@ def open_dataset(text: str) -> PoseDataset:
     name, colon, path = text.partition(":")
     if not colon or name not in FORMATS:
         raise UsageError(
-            f"data set: expected FORMAT:PATH with FORMAT one of {', '.join(FORMATS)}, found {text!r}"
+            f"data set: expected FORMAT:PATH with FORMAT one of {', '.join(FORMATS)}, "
+            f"found {text!r}"
         )
     return FORMATS[name](path)

@@ -68,7 +68,7 @@ class Light:
         self._drift, self._drift_phase = rng.uniform(0.02, 0.08), rng.uniform(0, 2 * math.pi)
 
     def shade(self, image: Levels, time_s: float, intrinsics: Pinhole) -> None:
-        """Shade an image taken at ``time_s``, in place; ``intrinsics`` are fx fy cx cy in pixels."""
+        """Shade an image taken at ``time_s``, in place; intrinsics are fx fy cx cy in pixels."""
         fx, fy, cx, cy = intrinsics
         height, width = image.shape[:2]
         x, y = (np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy

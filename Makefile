@@ -1,0 +1,49 @@
+# Each target does all of its own set-up: a fresh machine needs Python >= 3.11 with venv, pip and make.
+PYTHON ?= python3
+VENV := .venv
+DEMO_VENV := .venv-demo
+BUNDLE := calibration_artifacts/synthetic-room-cjp
+CLIP := calibration_artifacts/synthetic-room-clip
+
+.PHONY: help demo test check format clean
+
+help:
+	@echo "make demo    install the runtime alone and run a demonstration bundle on a sample clip"
+	@echo "make test    install both packages and run the test-suite (CVO_DATA: real data, optional)"
+	@echo "make check   lint, formatting, types and import rules"
+	@echo "make format  reformat the code"
+	@echo "make clean   remove both virtual environments"
+
+$(DEMO_VENV)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(DEMO_VENV)
+	$(DEMO_VENV)/bin/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/.installed: pyproject.toml export/pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	# torch first and by itself: on many machines the CPU build comes from an index of its own.
+	$(VENV)/bin/python -m pip install --quiet torch torchvision
+	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable ./export
+	@touch $@
+
+demo: $(DEMO_VENV)/.installed
+	$(DEMO_VENV)/bin/cvo-edge verify $(BUNDLE)
+	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE) $(CLIP) --ground-truth $(CLIP) --format table --max-frames 8 --quiet
+	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE) $(CLIP) --ground-truth $(CLIP) --output demo.jsonl
+	@echo "every frame's record: demo.jsonl"
+
+test: $(VENV)/.installed
+	$(VENV)/bin/python -m pytest
+
+check: $(VENV)/.installed
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	cd export && ../$(VENV)/bin/lint-imports --config ../pyproject.toml
+
+format: $(VENV)/.installed
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+clean:
+	rm -rf $(VENV) $(DEMO_VENV) demo.jsonl

@@ -1,0 +1,162 @@
+"""A training run: its options, its folder, and what it learned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import torch
+
+from cvo_edge.errors import UsageError
+from cvo_edge.preprocess import Crop
+from cvo_export.augment import AugmentConfig
+from cvo_export.backbone import Backbone, BackboneConfig
+from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.heads.cjp import CjpConfig, CjpNetwork
+from cvo_export.splits import Kind, Split, make_split, same_split
+from cvo_export.target import PoseGraph, Target
+
+CONFIG_FILE = "config.json"
+SPLIT_FILE = "split.json"
+NETWORK_FILE = "network.pt"
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides a run; written to ``config.json``.
+
+    Attributes
+    ----------
+    method, dataset, split, seed
+        What is trained on what; the seed decides split, training and noise.
+    height, width, crop
+        The model's input and which part of an image it shows.
+    backbone, weights
+        The image network and where its weights come from (``timm``, ``none`` or a file).
+    augment, copies
+        How the augmented copies of each training frame are changed, and how many there are.
+    head
+        The network behind the features and its loss.
+    steps, batch_size, learning_rate, weight_decay
+        AdamW on cached features; the rate rises over 50 steps and falls as a cosine.
+    warm_up_steps
+        Steps before the calibration term of the loss begins.
+    averaging
+        Decay of the running mean of the weights that is evaluated and kept.
+    fine_tune, backbone_learning_rate
+        Epochs in which the backbone learns, too, on fresh augmented images; the copies are then
+        computed anew and the head trained once more.
+    """
+
+    method: Literal["cjp"]
+    dataset: str
+    split: Kind
+    seed: int = 0
+    height: int = 192
+    width: int = 256
+    crop: Crop = "none"
+    backbone: BackboneConfig = field(default_factory=BackboneConfig)
+    weights: str = "timm"
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    copies: int = 12
+    head: CjpConfig = field(default_factory=CjpConfig)
+    steps: int = 6000
+    warm_up_steps: int = 200
+    batch_size: int = 64
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-3
+    averaging: float = 0.995
+    fine_tune: int = 0
+    backbone_learning_rate: float = 3e-4
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run: what it was asked for and what it learned.
+
+    ``history`` has an entry per evaluation on val: phase, step, loss, val_score.
+    """
+
+    config: TrainConfig
+    dataset: PoseDataset
+    split: Split
+    target: Target
+    graph: PoseGraph
+    weights_sha256: str | None
+    history: list[dict[str, float]]
+
+    def save(self, run_dir: Path) -> None:
+        """Write what training learned, whole or not at all."""
+        target = (self.target.reference_q_xyzw, self.target.mean, self.target.std)
+        partial = run_dir / (NETWORK_FILE + ".partial")
+        torch.save(
+            {
+                "graph": self.graph.state_dict(),
+                "target": [torch.from_numpy(values) for values in target],
+                "weights_sha256": self.weights_sha256,
+                "history": self.history,
+            },
+            partial,
+        )
+        partial.replace(run_dir / NETWORK_FILE)
+
+    def lines(self) -> list[str]:
+        """Return what was trained as lines of text for a person."""
+        counts = ", ".join(f"{role} {indices.size}" for role, indices in self.split.roles.items())
+        skipped = ", ".join(f"{count} {reason}" for reason, count in self.dataset.skipped.items())
+        last_phase = max(entry["phase"] for entry in self.history)
+        best = min(
+            (entry for entry in self.history if entry["phase"] == last_phase),
+            key=lambda entry: entry["val_score"],
+        )
+        parameters = sum(parameter.numel() for parameter in self.graph.parameters())
+        return [
+            f"data set    {self.dataset.name}: {len(self.dataset)} frames, {skipped or 'none'} "
+            "skipped",
+            f"split       {self.split.kind}: {counts}",
+            f"network     {self.config.backbone.name}, {parameters / 1e6:.2f} M parameters",
+            f"best        val score {best['val_score']:.3f} at step {best['step']:.0f}",
+        ]
+
+
+def open_run(run_dir: Path, config: TrainConfig) -> tuple[PoseDataset, Split]:
+    """Claim a run folder for a configuration and make its split.
+
+    Raises UsageError where the folder belongs to another configuration.
+    """
+    run_dir.mkdir(parents=True, exist_ok=True)
+    path = run_dir / CONFIG_FILE
+    content = msgspec.json.format(msgspec.json.encode(config), indent=1)
+    if not path.exists():
+        path.write_bytes(content)
+    elif path.read_bytes() != content:
+        raise UsageError(
+            f"{run_dir}: expected a new folder or a run of the same options, found another run"
+        )
+    dataset = open_dataset(config.dataset)
+    split = make_split(dataset, config.split, config.seed)
+    split.write(run_dir / SPLIT_FILE, dataset)
+    return dataset, split
+
+
+def load_run(run_dir: Path, dataset: str | None = None) -> Run:
+    """Read a finished run; ``dataset`` says where its data set is now, if it has moved.
+
+    Raises UsageError where the folder holds no finished run, SourceError where the data set is not
+    the one that was split.
+    """
+    path = run_dir / NETWORK_FILE
+    if not path.is_file():
+        raise UsageError(f"{run_dir}: expected a finished run, found no {NETWORK_FILE}")
+    config = msgspec.json.decode((run_dir / CONFIG_FILE).read_bytes(), type=TrainConfig)
+    recorded = msgspec.json.decode((run_dir / SPLIT_FILE).read_bytes())
+    opened = open_dataset(dataset or config.dataset)
+    split = same_split(opened, config.split, config.seed, recorded["sha256"])
+    stored = torch.load(path, weights_only=True)
+    target = Target(*(values.numpy() for values in stored["target"]))
+    backbone = Backbone(config.backbone, config.height, config.width)
+    graph = PoseGraph(backbone, CjpNetwork(backbone.size, config.head), target).eval()
+    graph.load_state_dict(stored["graph"])
+    return Run(config, opened, split, target, graph, stored["weights_sha256"], stored["history"])

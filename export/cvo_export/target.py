@@ -1,0 +1,106 @@
+"""What the network learns: six standardised numbers of a pose, and the way back in the graph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from cvo_edge import geometry
+from cvo_edge.errors import UsageError
+from cvo_edge.pose import Chart
+from cvo_export.backbone import Backbone
+from cvo_export.heads.cjp import CjpDecoded, CjpNetwork
+
+Array = NDArray[np.float64]
+
+# Beyond this spread about the mean rotation the tangent at it comes near its cut at pi.
+MAX_SPREAD_RAD = 2.0
+
+
+@dataclass(frozen=True)
+class Target:
+    """Standardised degrees of freedom: tx ty tz and Log(R_reference^T R), over train and fit.
+
+    ``reference_q_xyzw`` (4,); ``mean`` and ``std`` (6,) in metres and radians.
+    """
+
+    reference_q_xyzw: Array
+    mean: Array
+    std: Array
+
+    @property
+    def chart(self) -> Chart:
+        """The chart whose coordinates are standardised."""
+        return Chart("tangent_reference", self.reference_q_xyzw)
+
+    def coordinates(self, poses: Array) -> Array:
+        """Poses (..., 7) -> coordinates (..., 6), m and rad."""
+        return self.chart.coordinates(poses, poses)
+
+    def standardised(self, poses: Array) -> Array:
+        """Poses (..., 7) -> numbers (..., 6) of mean 0 and deviation 1 over train and fit."""
+        return (self.coordinates(poses) - self.mean) / self.std
+
+
+def fit_target(poses: Array) -> Target:
+    """Mean rotation, mean and deviation of training poses (n, 7).
+
+    Raises UsageError where rotations spread too far for one tangent or a DoF never changes.
+    """
+    reference = geometry.mean_rotation(poses[:, 3:])
+    coordinates = Chart("tangent_reference", reference).coordinates(poses, poses)
+    spread = float(np.linalg.norm(coordinates[:, 3:], axis=1).max())
+    if spread > MAX_SPREAD_RAD:
+        raise UsageError(
+            f"poses: expected rotations within {MAX_SPREAD_RAD:g} rad of their mean, found one at "
+            f"{spread:.2f} rad; the tangent at one reference cannot hold a full turn"
+        )
+    deviation = coordinates.std(axis=0)
+    if not (deviation > 1e-6).all():
+        raise UsageError(
+            "poses: expected motion in every degree of freedom, found standard deviations "
+            f"{deviation.tolist()}"
+        )
+    return Target(reference, coordinates.mean(axis=0), deviation)
+
+
+class PoseGraph(nn.Module):
+    """What is exported: images (n, height, width, 3) -> pose (n, 7), lower and upper (n, 6)."""
+
+    def __init__(self, backbone: Backbone, network: CjpNetwork, target: Target) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.decoded = CjpDecoded(network)
+        for name, values in (
+            ("mean", target.mean),
+            ("std", target.std),
+            ("left", _left_product(target.reference_q_xyzw)),
+        ):
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float32))
+        self.mean: Tensor
+        self.std: Tensor
+        self.left: Tensor
+
+    def forward(self, image: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return pose, lower and upper in metres and radians; noise in ``sample`` mode only."""
+        point, lower, upper = (
+            values * self.std + self.mean for values in self.decoded(self.backbone(image), noise)
+        )
+        # R = R_reference Exp(r), as quaternions.
+        q_xyzw = _exp(point[:, 3:]) @ self.left.T
+        return torch.cat([point[:, :3], q_xyzw], dim=1), lower, upper
+
+
+def _exp(rotvec: Tensor) -> Tensor:
+    """Rotation vectors (n, 3) -> quaternions (n, 4); 1e-12 keeps the quotient at zero finite."""
+    angle = (rotvec.square().sum(dim=1, keepdim=True) + 1e-12).sqrt()
+    return torch.cat([rotvec * (torch.sin(0.5 * angle) / angle), torch.cos(0.5 * angle)], dim=1)
+
+
+def _left_product(q_xyzw: Array) -> Array:
+    """Matrix L (4, 4) with L p = q p, the Hamilton product from the left."""
+    return geometry.quaternion_multiply(q_xyzw, np.eye(4)).T
