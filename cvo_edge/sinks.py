@@ -8,9 +8,8 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from types import TracebackType
-from typing import IO, Literal
+from typing import Literal
 
 import msgspec
 
@@ -23,7 +22,7 @@ _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
 
 
 class Sink:
-    """Writes one line a frame and flushes it: an acknowledged record survives the process.
+    """Writes one line a frame, past every buffer of ours: an acknowledged record survives us.
 
     Parameters
     ----------
@@ -39,16 +38,18 @@ class Sink:
     """
 
     def __init__(self, path: str, format: Format) -> None:
-        self._name = "standard output" if path == "-" else path
         self._header, self._line = _FORMATS[format]
         self._owned = path != "-"
+        self._name = path if self._owned else "standard output"
+        self._started = False
         try:
-            self._stream: IO[bytes] = (
-                Path(path).open("wb") if self._owned else sys.stdout.buffer  # noqa: SIM115
+            self._descriptor = (
+                os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+                if self._owned
+                else sys.stdout.fileno()
             )
         except OSError as error:
-            raise SinkError(f"{path}: cannot be written: {error.strerror}") from None
-        self._started = False
+            raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
 
     def __enter__(self) -> Sink:
         """Return itself."""
@@ -62,7 +63,7 @@ class Sink:
     ) -> None:
         """Close the file, if it is one."""
         if self._owned:
-            self._stream.close()
+            os.close(self._descriptor)
 
     def write(self, estimate: PoseInterval) -> None:
         """Write one estimate.
@@ -74,18 +75,13 @@ class Sink:
             self._started = True
             if self._header:
                 self._put(self._header(estimate))
-        line = self._line(estimate)
-        if line:
-            self._put(line)
+        self._put(self._line(estimate))
 
     def _put(self, line: bytes) -> None:
         try:
-            self._stream.write(line)
-            self._stream.flush()
+            while line:
+                line = line[os.write(self._descriptor, line) :]
         except BrokenPipeError:
-            if not self._owned:
-                # Python flushes stdout once more at exit; without this it would complain then.
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise
         except OSError as error:
             raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None

@@ -21,7 +21,11 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """How strongly a copy of a training image is changed.
+    """How strongly a training image is changed at most.
+
+    Copies are graded: the first hardly differs, the last in full. Weak changes keep a network
+    precise between neighbouring frames, strong ones carry it to new sequences; a data set needs
+    one or the other, and graded copies serve both.
 
     Attributes
     ----------
@@ -33,6 +37,10 @@ class AugmentConfig:
 
     rotation_deg: float = 6.0
     light: float = 1.0
+
+    def graded(self, share: float) -> AugmentConfig:
+        """Return this share, 0 to 1, of the strength."""
+        return AugmentConfig(share * self.rotation_deg, share * self.light)
 
 
 def model_intrinsics(

@@ -254,7 +254,7 @@ class _Sets:
         if marginal is None or joint is None:
             return {}
         covered = self.inside(marginal)[0]
-        jointly = self.inside(joint)[0].all(axis=1)
+        jointly = np.asarray(self.inside(joint)[0].all(axis=1))
         found = {}
         for number in np.unique(self.seen.sequence).tolist():
             rows = np.flatnonzero(np.equal(self.seen.sequence, number))

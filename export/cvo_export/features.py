@@ -90,8 +90,8 @@ def cached_copies(
         path = folder / f"copy-{number:03d}.npz"
         if not path.is_file():
             generator = np.random.default_rng((seed, number))
-            chosen = config if number else AugmentConfig(0.0, 0.0)
-            found = _one_copy(images, extractor, chosen, generator)
+            graded = config.graded(number / max(1, copies))
+            found = _one_copy(images, extractor, graded, generator)
             partial = path.with_suffix(".partial")
             with partial.open("wb") as stream:
                 np.savez(stream, features=found[0], poses=found[1])

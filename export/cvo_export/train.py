@@ -131,8 +131,10 @@ class _Trainer:
 
         def batch(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
             rows = generator.integers(len(self.images), size=_IMAGE_BATCH)
+            augment = self.config.augment
             drawn = [
-                self.images.augmented(row, self.config.augment, generator) for row in rows.tolist()
+                self.images.augmented(row, augment.graded(generator.random()), generator)
+                for row in rows.tolist()
             ]
             y = self.target.standardised(np.stack([pose for _, pose in drawn]))
             stacked = torch.from_numpy(np.stack([image for image, _ in drawn]))

@@ -1,0 +1,84 @@
+"""The sharp check of validity: heads fixed, calibration and test pooled, dealt anew many times.
+
+    python bench/resplit.py BUNDLE DATASET [--resplits 200] [--json FILE]
+
+One split's coverage scatters by several percent around its expectation k/(n+1). Dealing the pooled
+frames into calibration and test again and again, with the network fixed, averages that away: what
+is left is whether scores, rank rule and sets are right.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.artifact import read_bundle
+from cvo_edge.conformal import conformal_quantile, conformal_rank, joint_scores
+from cvo_edge.odometer import Odometer
+from cvo_export.calibrate import joint_scales, observe
+from cvo_export.datasets import open_dataset
+from cvo_export.splits import same_split
+
+CONFIDENCE = 0.9
+
+
+def resplit(
+    scores: NDArray[np.float64], n: int, scales: NDArray[np.float64], resplits: int
+) -> tuple[NDArray[np.float64], float]:
+    """Mean coverage per DoF (6,) and mean joint coverage over many deals of scores (m, 6)."""
+    generator = np.random.default_rng(0)
+    marginal, jointly = [], []
+    joint = joint_scores(scores, scales)
+    for _ in range(resplits):
+        order = generator.permutation(len(scores))
+        cal, test = order[:n], order[n:]
+        q_hat = [conformal_quantile(scores[cal, dof], CONFIDENCE) for dof in range(6)]
+        marginal.append((scores[test] <= q_hat).mean(axis=0))
+        jointly.append((joint[test] <= conformal_quantile(joint[cal], CONFIDENCE)).mean())
+    return np.mean(marginal, axis=0), float(np.mean(jointly))
+
+
+def main() -> None:
+    """Print mean coverages beside k/(n+1); write them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("bundle", type=Path)
+    parser.add_argument("dataset")
+    parser.add_argument("--resplits", type=int, default=200)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    bundle = read_bundle(arguments.bundle)
+    recorded = bundle.calibration.calibration.split
+    dataset = open_dataset(arguments.dataset)
+    roles = same_split(dataset, recorded.kind, recorded.seed, recorded.sha256).roles
+    with Odometer(bundle) as odometer:
+        seen = observe(odometer, dataset, np.concatenate([roles["cal"], roles["test"]]))
+        scores = odometer.head.scores(seen.outputs, seen.point, seen.truth)
+        val = observe(odometer, dataset, roles["val"])
+        scales = joint_scales(odometer.head.scores(val.outputs, val.point, val.truth))
+    n = roles["cal"].size
+    expected = conformal_rank(n, CONFIDENCE) / (n + 1)
+    marginal, jointly = resplit(scores, n, scales, arguments.resplits)
+    worst = max(abs(float(value) - expected) for value in (*marginal, jointly))
+    print(f"{arguments.resplits} deals of {len(scores)} frames, n = {n}: k/(n+1) = {expected:.4f}")
+    print("coverage per DoF " + " ".join(f"{value:.4f}" for value in marginal))
+    print(f"joint coverage   {jointly:.4f}")
+    print(f"largest difference {worst:.4f}")
+    if arguments.json:
+        report = {
+            "bundle": bundle.calibration.name,
+            "resplits": arguments.resplits,
+            "n": n,
+            "expected": expected,
+            "coverage": marginal.tolist(),
+            "joint_coverage": jointly,
+            "largest_difference": worst,
+        }
+        arguments.json.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

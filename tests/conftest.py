@@ -1,0 +1,68 @@
+"""Shared fixtures: the demonstration bundle, its clip, and real data where CVO_DATA names it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import settings
+
+from cvo_edge import artifact
+from cvo_edge.artifact import Bundle, Calibration
+
+# Shared machines are slow now and then: a law that holds late still holds.
+settings.register_profile("project", deadline=None)
+settings.load_profile("project")
+
+ROOT = Path(__file__).resolve().parent.parent
+ARTIFACTS = ROOT / "calibration_artifacts"
+
+
+@pytest.fixture(scope="session")
+def bundle_dir() -> Path:
+    return ARTIFACTS / "synthetic-room-cjp"
+
+
+@pytest.fixture(scope="session")
+def clip_dir() -> Path:
+    return ARTIFACTS / "synthetic-room-clip"
+
+
+@pytest.fixture(scope="session")
+def bundle(bundle_dir: Path) -> Bundle:
+    return artifact.read_bundle(bundle_dir)
+
+
+@pytest.fixture
+def copied_bundle(bundle_dir: Path, tmp_path: Path) -> Path:
+    """A copy of the demonstration bundle that a test may damage."""
+    return Path(shutil.copytree(bundle_dir, tmp_path / "bundle"))
+
+
+@pytest.fixture
+def rewrite(copied_bundle: Path) -> Callable[[Calibration], Path]:
+    """Write another calibration into the copied bundle, with its digest made to fit."""
+
+    def write(calibration: Calibration) -> Path:
+        content = artifact.encode_calibration(calibration)
+        (copied_bundle / artifact.CALIBRATION_FILE).write_bytes(content)
+        return copied_bundle
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder with real recordings; skips visibly without it."""
+    folder = os.environ.get("CVO_DATA")
+    if not folder:
+        pytest.skip("CVO_DATA is not set: no real data")
+    return Path(folder)
+
+
+def changed(calibration: Calibration, **values: object) -> Calibration:
+    return msgspec.structs.replace(calibration, **values)

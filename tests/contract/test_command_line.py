@@ -1,0 +1,230 @@
+"""The command line as a user runs it: records, gates, exit codes, signals."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cvo_edge import Odometer, open_source
+
+CVO_EDGE = [sys.executable, "-c", "from cvo_edge.cli import main; main()"]
+
+
+def cvo_edge(*arguments, **options):
+    command = [*CVO_EDGE, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+def refused(result, code):
+    """One line on stderr, the documented code, no traceback."""
+    assert result.returncode == code, result.stderr
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("cvo-edge: ")
+    return lines[0]
+
+
+def test_run_and_ten_lines_of_python_give_equal_numbers(bundle_dir, clip_dir):
+    result = cvo_edge("run", bundle_dir, clip_dir, "--max-frames", 5)
+    assert result.returncode == 0
+    records = [json.loads(line) for line in result.stdout.splitlines()]
+    with Odometer.load(bundle_dir) as odometer:
+        for record, estimate in zip(
+            records, odometer.stream(list(open_source(str(clip_dir)))[:5]), strict=True
+        ):
+            expected = estimate.to_dict()
+            assert record["pose"] == expected["pose"]
+            assert record["interval"] == json.loads(json.dumps(expected["interval"]))
+    assert "frames      5: 5 ok" in result.stderr
+
+
+def test_summary_has_coverage_where_there_is_ground_truth(bundle_dir, clip_dir, tmp_path):
+    out = tmp_path / "out.jsonl"
+    result = cvo_edge("run", bundle_dir, clip_dir, "--ground-truth", clip_dir, "-o", out)
+    assert result.returncode == 0
+    assert result.stdout == ""
+    assert "coverage" in result.stderr
+    frames = len(list(clip_dir.glob("*.color.jpg")))
+    assert len(out.read_text().splitlines()) == frames
+    assert f"of {frames} frames" in result.stderr
+
+
+def test_quiet_is_quiet(bundle_dir, clip_dir):
+    result = cvo_edge("run", bundle_dir, clip_dir, "--max-frames", 1, "--quiet")
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+def test_a_reader_that_leaves_ends_it_quietly(bundle_dir, clip_dir):
+    with subprocess.Popen(
+        [*CVO_EDGE, "run", str(bundle_dir), str(clip_dir), "--quiet"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait(60) == 0
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_it_with_every_record_whole(bundle_dir, clip_dir, tmp_path, number, code):
+    # Links to one image make a source that is long enough to be interrupted.
+    image = next(iter(sorted(clip_dir.glob("*.color.jpg"))))
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for index in range(20_000):
+        os.link(image, frames / f"{index}.jpg") if index < 2 else (
+            frames / f"{index}.jpg"
+        ).symlink_to(image)
+    out = tmp_path / "out.jsonl"
+    with subprocess.Popen(
+        [*CVO_EDGE, "run", str(bundle_dir), str(frames), "-o", str(out), "--quiet"],
+        stderr=subprocess.PIPE,
+    ) as process:
+        deadline = time.monotonic() + 60
+        while not (out.exists() and out.stat().st_size > 5000):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        process.send_signal(number)
+        assert process.wait(10) == code
+        assert process.stderr.read() == b""
+    content = out.read_text()
+    assert content.endswith("\n")
+    sequence = [json.loads(line)["seq"] for line in content.splitlines()]
+    assert sequence == list(range(len(sequence)))
+    assert 0 < len(sequence) < 20_000
+
+
+def test_killed_without_warning_loses_no_acknowledged_record(bundle_dir, clip_dir):
+    with subprocess.Popen(
+        [*CVO_EDGE, "run", str(bundle_dir), str(clip_dir), "--quiet"], stdout=subprocess.PIPE
+    ) as process:
+        first = process.stdout.readline()
+        process.kill()
+        rest = process.stdout.read()
+    assert json.loads(first)["seq"] == 0
+    complete = rest.decode().splitlines()[: rest.count(b"\n")]
+    assert [json.loads(line)["seq"] for line in complete] == list(range(1, len(complete) + 1))
+
+
+def test_exit_2_for_what_cannot_be_asked(bundle_dir, clip_dir):
+    assert "0.5, 0.8, 0.9, 0.95, 0.99" in refused(
+        cvo_edge("run", bundle_dir, clip_dir, "--confidence", 0.42), 2
+    )
+    assert "--fps" in refused(cvo_edge("run", bundle_dir, clip_dir, "--format", "tum"), 2)
+    refused(cvo_edge("run", bundle_dir, clip_dir, "--scope", "both"), 2)
+    refused(cvo_edge("run", bundle_dir), 2)
+    refused(cvo_edge("walk"), 2)
+
+
+def test_exit_3_4_5_for_a_broken_bundle(copied_bundle, clip_dir):
+    model = copied_bundle / "model.onnx"
+    whole = model.read_bytes()
+    model.write_bytes(whole[:-1])
+    assert "sha256" in refused(cvo_edge("run", copied_bundle, clip_dir), 5)
+    model.unlink()
+    refused(cvo_edge("run", copied_bundle, clip_dir), 4)
+    model.write_bytes(whole)
+    path = copied_bundle / "calibration.json"
+    path.write_bytes(path.read_bytes().replace(b"0", b"1", 1))
+    refused(cvo_edge("run", copied_bundle, clip_dir), 3)
+    refused(cvo_edge("inspect", copied_bundle), 3)
+    refused(cvo_edge("verify", copied_bundle), 3)
+
+
+def test_exit_6_for_a_source_that_gives_nothing(bundle_dir, tmp_path):
+    refused(cvo_edge("run", bundle_dir, tmp_path / "nowhere"), 6)
+    refused(cvo_edge("run", bundle_dir, tmp_path), 6)
+    for index in range(2):
+        (tmp_path / f"{index}.png").write_bytes(b"\x89PNG damaged")
+    result = cvo_edge("run", bundle_dir, tmp_path, "--quiet")
+    refused(result, 6)
+    assert [json.loads(line)["status"] for line in result.stdout.splitlines()] == ["invalid"] * 2
+
+
+def test_exit_6_for_a_video_cut_short_with_its_records_kept(bundle_dir, tmp_path):
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (320, 240))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no video")
+    generator = np.random.default_rng(0)
+    for _ in range(30):
+        writer.write(generator.integers(0, 255, (240, 320, 3)).astype(np.uint8))
+    writer.release()
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * 0.6)])
+    result = cvo_edge("run", bundle_dir, path, "--quiet")
+    if "opens" in result.stderr:
+        pytest.skip("this OpenCV opens no video without its index")
+    assert "of 30" in refused(result, 6)
+    assert len(result.stdout.splitlines()) > 0
+
+
+def test_exit_7_for_an_output_that_cannot_be_written(bundle_dir, clip_dir, tmp_path):
+    refused(cvo_edge("run", bundle_dir, clip_dir, "-o", tmp_path / "no" / "out.jsonl"), 7)
+    if Path("/dev/full").exists():
+        result = cvo_edge("run", bundle_dir, clip_dir, "-o", "/dev/full", "--quiet")
+        assert "No space left" in refused(result, 7)
+
+
+def test_bench_reports_the_documented_keys_and_gates_by_exit_8(bundle_dir, clip_dir, tmp_path):
+    report_file = tmp_path / "bench.json"
+    arguments = ("bench", bundle_dir, clip_dir, "--frames", 10, "--warmup", 2)
+    result = cvo_edge(*arguments, "--json", report_file)
+    assert result.returncode == 0, result.stderr
+    report = json.loads(report_file.read_text())
+    for stage in ("read", "preprocess", "model", "conformal", "total"):
+        assert list(report["latency_ms"][stage]) == ["p50", "p90", "p95", "p99", "mean"]
+    for key in (
+        "raw_model_ms",
+        "ratio_to_raw",
+        "throughput_fps",
+        "load_ms",
+        "first_interval_ms",
+        "cpu_ms_per_frame",
+        "memory_mib",
+        "environment",
+        "frames",
+    ):
+        assert key in report
+    assert set(report["memory_mib"]) == {"peak_rss", "rss", "anonymous"}
+    for gate in (("--max-p95-ms", 1e-6), ("--max-rss-mib", 1)):
+        failed = cvo_edge(*arguments, *gate)
+        assert failed.returncode == 8
+        assert "bench: expected" in failed.stderr
+
+
+def test_verify_passes_here_and_fails_where_outputs_differ(bundle_dir, rewrite, bundle):
+    assert "self-test passed" in cvo_edge("verify", bundle_dir).stdout
+    import msgspec
+
+    test = bundle.calibration.selftest
+    shifted = {name: tuple(v + 0.01 for v in values) for name, values in test.outputs.items()}
+    folder = rewrite(
+        msgspec.structs.replace(
+            bundle.calibration, selftest=msgspec.structs.replace(test, outputs=shifted)
+        )
+    )
+    assert "self-test" in refused(cvo_edge("verify", folder), 8)
+
+
+def test_inspect_schema_doctor_and_version_answer(bundle_dir):
+    shown = cvo_edge("inspect", bundle_dir)
+    assert "q_hat at" in shown.stdout
+    assert "0.9 joint" in shown.stdout
+    as_json = json.loads(cvo_edge("inspect", bundle_dir, "--json").stdout)
+    assert as_json["schema_version"] == 1
+    schema = json.loads(cvo_edge("schema").stdout)
+    calibration = schema["$defs"]["Calibration"]
+    assert set(calibration["required"]) == set(as_json)
+    assert calibration["additionalProperties"] is False
+    assert json.loads(cvo_edge("doctor", "--json").stdout)["cores_allowed"] >= 1
+    assert cvo_edge("--version").stdout.startswith("cvo-edge ")
+    assert "Usage" in cvo_edge().stdout

@@ -1,0 +1,65 @@
+"""Fences: what the runtime may import, what it exposes, what each error returns."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import cvo_edge
+from cvo_edge import errors
+
+PACKAGE = Path(cvo_edge.__file__).parent
+MODULES = sorted(
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+    for path in PACKAGE.rglob("*.py")
+)
+FORBIDDEN = {"torch", "torchvision", "timm", "onnx", "sklearn", "scipy", "cvo_export", "pydantic"}
+
+
+def fresh_process(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+
+def test_every_module_of_the_runtime_imports_without_the_training_side():
+    names = [name.removesuffix(".__init__") for name in MODULES]
+    assert "cvo_edge.cli" in names
+    assert "cvo_edge.heads.cjp" in names
+    code = f"import importlib, sys\nfor name in {names}: importlib.import_module(name)\n"
+    found = fresh_process(code + "print(*sys.modules, sep='\\n')").stdout.splitlines()
+    assert FORBIDDEN.isdisjoint(name.split(".")[0] for name in found)
+
+
+def test_importing_the_package_needs_no_command_line():
+    code = (
+        "import cvo_edge, sys, logging\n"
+        "print(*sys.modules, sep='\\n')\n"
+        "assert not logging.root.handlers"
+    )
+    found = fresh_process(code).stdout.splitlines()
+    assert {"typer", "rich", "click"}.isdisjoint(name.split(".")[0] for name in found)
+
+
+def test_the_public_names_are_sorted_and_exist():
+    assert cvo_edge.__all__ == sorted(cvo_edge.__all__)
+    assert all(hasattr(cvo_edge, name) for name in cvo_edge.__all__)
+
+
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        ("UsageError", 2),
+        ("CalibrationFileError", 3),
+        ("ModelError", 4),
+        ("BundleMismatchError", 5),
+        ("SourceError", 6),
+        ("SinkError", 7),
+        ("GateError", 8),
+    ],
+)
+def test_each_error_has_its_documented_exit_code(name, code):
+    error = getattr(errors, name)
+    assert issubclass(error, errors.CvoError)
+    assert error.exit_code == code
+    assert name in cvo_edge.__all__
+    assert f"{name} " in (errors.__doc__ or "")

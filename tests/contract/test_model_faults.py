@@ -1,0 +1,118 @@
+"""What the network may give and what becomes of it, by small models made for the purpose."""
+
+import hashlib
+
+import msgspec
+import numpy as np
+import pytest
+
+from cvo_edge import Bundle, Odometer, Reason, Status, artifact
+from cvo_edge.artifact import Threshold, decode_calibration, encode_calibration
+
+onnx = pytest.importorskip("onnx")
+
+
+def constant_model(pose, lower, upper, height=192, width=256):
+    """A model that answers the same to every image (times zero of it, so that it is used)."""
+    helper = onnx.helper
+    outputs = {"pose": pose, "lower": lower, "upper": upper}
+    nodes = [
+        helper.make_node("Cast", ["image"], ["real"], to=onnx.TensorProto.FLOAT),
+        helper.make_node("ReduceMin", ["real"], ["least"], keepdims=0),
+        helper.make_node("Mul", ["least", "zero"], ["nothing"]),
+    ]
+    constants = [onnx.numpy_helper.from_array(np.float32(0.0), "zero")]
+    infos = []
+    for name, values in outputs.items():
+        array = np.array([values], dtype=np.float32)
+        constants.append(onnx.numpy_helper.from_array(array, f"{name}_values"))
+        nodes.append(helper.make_node("Add", [f"{name}_values", "nothing"], [name]))
+        infos.append(helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, array.shape))
+    image = helper.make_tensor_value_info("image", onnx.TensorProto.UINT8, [1, height, width, 3])
+    graph = helper.make_graph(nodes, "constant", [image], infos, constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    return model.SerializeToString()
+
+
+IDENTITY = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def odometer(bundle, pose=IDENTITY, lower=(-1.0,) * 6, upper=(1.0,) * 6, q_hat=(0.5,) * 6):
+    model_bytes = constant_model(pose, lower, upper)
+    calibration = bundle.calibration
+    model = msgspec.structs.replace(
+        calibration.model, sha256=hashlib.sha256(model_bytes).hexdigest()
+    )
+    limits = artifact.PoseLimits(lowest=(-4.0,) * 6, highest=(4.0,) * 6)
+    changed = msgspec.structs.replace(
+        calibration,
+        model=model,
+        pose=msgspec.structs.replace(
+            calibration.pose, limits=limits, reference_q_xyzw=(0.0, 0.0, 0.0, 1.0)
+        ),
+        calibration=msgspec.structs.replace(calibration.calibration, score="additive"),
+        thresholds=(Threshold(confidence=0.9, scope="marginal", q_hat=q_hat, q_hat_upper=None),),
+    )
+    return Odometer(Bundle(decode_calibration(encode_calibration(changed)), model_bytes))
+
+
+def step(bundle, **outputs):
+    with odometer(bundle, **outputs) as made:
+        return made.step(np.zeros((240, 320, 3), np.uint8))
+
+
+def test_the_additive_set_is_the_bounds_plus_and_minus_the_threshold(bundle):
+    found = step(bundle)
+    np.testing.assert_allclose(found.lower, -1.5)
+    np.testing.assert_allclose(found.upper, 1.5)
+    assert found.status is Status.OK
+
+
+def test_a_set_is_exactly_where_the_score_is_at_most_the_threshold(bundle):
+    with odometer(bundle) as made:
+        seen = made.observe(np.zeros((240, 320, 3), np.uint8), 0)
+        region = made.region(seen)
+        for y in np.linspace(-3, 3, 61):
+            truth = np.full((1, 6), y)
+            score = made.head.scores(seen.outputs, seen.point[None], truth)[0]
+            np.testing.assert_array_equal(score <= 0.5, region.covers(truth[0]))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("output", ["pose", "lower", "upper"])
+def test_one_value_that_is_not_finite_makes_the_frame_invalid(bundle, output, value):
+    values = {"pose": list(IDENTITY), "lower": [-1.0] * 6, "upper": [1.0] * 6}
+    values[output][2] = value
+    found = step(bundle, **values)
+    assert found.status is Status.INVALID
+    assert found.reasons == (Reason.OUTPUT_NOT_FINITE,)
+    assert found.pose is None
+    assert not found.bounded
+
+
+@pytest.mark.parametrize("pose", [[1e38, 0, 0, 0, 0, 0, 1], [5, 0, 0, 0, 0, 0, 1], [0] * 7])
+def test_an_absurd_pose_makes_the_frame_invalid(bundle, pose):
+    found = step(bundle, pose=pose)
+    assert found.status is Status.INVALID
+    assert found.reasons == (Reason.POSE_IMPLAUSIBLE,)
+
+
+def test_an_emptied_set_becomes_its_middle_and_says_so(bundle):
+    found = step(bundle, lower=(-0.2,) * 6, upper=(0.4,) * 6, q_hat=(-0.5,) * 6)
+    np.testing.assert_allclose(found.lower, 0.1)
+    np.testing.assert_allclose(found.upper, 0.1)
+    assert found.reasons == (Reason.BOUNDS_CROSSED,)
+
+
+def test_too_few_scores_are_unbounded_and_stay_so_to_the_record(bundle):
+    found = step(bundle, q_hat=(None, 0.5, 0.5, 0.5, 0.5, 0.5))
+    record = found.to_dict()["interval"]
+    assert record["lower"][0] is None
+    assert record["upper"][0] is None
+    assert record["bounded"] is False
+    assert record["lower"][1] == pytest.approx(-1.5)
+
+
+def test_a_quaternion_of_any_length_and_sign_is_the_same_rotation(bundle):
+    found = step(bundle, pose=[0, 0, 0, 0, 0, 0, -3.0])
+    np.testing.assert_allclose(found.pose.q_xyzw, [0, 0, 0, 1])

@@ -1,0 +1,111 @@
+"""The rank rule and its relatives against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cvo_edge.conformal import (
+    conformal_quantile,
+    conformal_rank,
+    effective_sample_size,
+    hierarchical_quantile,
+    interval_score,
+    joint_scores,
+)
+from cvo_edge.errors import UsageError
+
+scores = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60)
+
+
+@pytest.mark.parametrize(
+    ("n", "confidence", "rank"),
+    [(19, 0.95, 19), (9, 0.9, 9), (8, 0.9, 9), (99, 0.99, 99), (100, 0.9, 91), (39, 0.95, 38)],
+)
+def test_rank_is_exact_where_the_product_is_whole(n, confidence, rank):
+    assert conformal_rank(n, confidence) == rank
+
+
+@given(scores, st.sampled_from([0.5, 0.8, 0.9, 0.95, 0.99]))
+def test_threshold_is_the_order_statistic_or_unbounded(values, confidence):
+    k = conformal_rank(len(values), confidence)
+    found = conformal_quantile(values, confidence)
+    assert found == (sorted(values)[k - 1] if k <= len(values) else math.inf)
+
+
+@given(scores, st.sampled_from([0.5, 0.8, 0.9]))
+def test_threshold_is_never_the_maximum_in_place_of_infinity(values, confidence):
+    if math.isfinite(conformal_quantile(values, confidence)):
+        assert np.mean(np.array(values) <= conformal_quantile(values, confidence)) >= confidence
+
+
+@given(scores)
+def test_threshold_grows_with_the_confidence(values):
+    found = [conformal_quantile(values, c) for c in (0.5, 0.8, 0.9, 0.95, 0.99)]
+    assert found == sorted(found)
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40, unique=True))
+def test_sequences_of_one_frame_make_the_hierarchical_rule_the_pooled_one(values):
+    for confidence in (0.5, 0.8, 0.9):
+        assert hierarchical_quantile(values, range(len(values)), confidence) == (
+            conformal_quantile(values, confidence)
+        )
+
+
+@pytest.mark.parametrize(("sequences", "bounded"), [(8, False), (9, True), (18, True)])
+def test_hierarchical_needs_nine_sequences_at_ninety_percent(sequences, bounded):
+    values = np.arange(sequences * 5.0)
+    found = hierarchical_quantile(values, np.repeat(np.arange(sequences), 5), 0.9)
+    assert math.isfinite(found) is bounded
+
+
+def test_hierarchical_weighs_sequences_not_frames():
+    # One long sequence of small scores must not drown nine short ones of large scores.
+    values = np.concatenate([np.zeros(1000), np.ones(9)])
+    sequence = np.concatenate([np.zeros(1000), np.arange(1, 10)])
+    assert hierarchical_quantile(values, sequence, 0.8) == 1.0
+    assert conformal_quantile(values, 0.8) == 0.0
+
+
+@pytest.mark.parametrize("confidence", [0.0, 1.0, -0.1, math.nan])
+def test_confidence_outside_the_unit_interval_is_refused(confidence):
+    with pytest.raises(UsageError, match="confidence"):
+        conformal_quantile([1.0], confidence)
+
+
+def test_nan_scores_are_refused():
+    with pytest.raises(UsageError, match="1 NaN among 3"):
+        conformal_quantile([1.0, math.nan, 2.0], 0.5)
+    with pytest.raises(UsageError, match="NaN"):
+        hierarchical_quantile([math.nan], [0], 0.5)
+
+
+def test_joint_score_is_the_largest_scaled_one():
+    np.testing.assert_array_equal(joint_scores([[1.0, 4.0], [-1.0, -8.0]], [1.0, 2.0]), [2.0, -1.0])
+    with pytest.raises(UsageError, match="positive"):
+        joint_scores([[1.0, 1.0]], [1.0, 0.0])
+
+
+@given(st.floats(-5, 5), st.floats(0, 5), st.floats(-10, 10))
+def test_interval_score_is_width_inside_and_grows_twice_over_alpha_outside(low, width, y):
+    distance = max(low - y, y - (low + width), 0.0)
+    assert interval_score(width, distance, 0.1) == pytest.approx(width + 20.0 * distance)
+
+
+def test_effective_size_of_independent_draws_is_their_number():
+    n = 4000
+    draws = np.random.default_rng(0).standard_normal(n)
+    assert effective_sample_size(draws) == pytest.approx(n, rel=0.15)
+
+
+@pytest.mark.parametrize("phi", [0.5, 0.9])
+def test_effective_size_of_an_autoregression_is_the_closed_form(phi):
+    n = 50_000
+    generator = np.random.default_rng(1)
+    series = np.zeros(n)
+    for index in range(1, n):
+        series[index] = phi * series[index - 1] + generator.standard_normal()
+    assert effective_sample_size(series) == pytest.approx(n * (1 - phi) / (1 + phi), rel=0.25)

@@ -1,0 +1,94 @@
+"""Formats: what each line holds, and what a disk that refuses leaves behind."""
+
+import csv
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cvo_edge import Odometer, SinkError, UsageError, open_source
+from cvo_edge.pose import unbounded_set
+from cvo_edge.sinks import Sink
+
+
+@pytest.fixture(scope="module")
+def estimates(bundle_dir, clip_dir):
+    frames = list(open_source(str(clip_dir), fps=30))[:3]
+    with Odometer.load(bundle_dir) as odometer:
+        good = list(odometer.stream(frames))
+        return [*good, odometer.step(None, stamp_ns=99, source="lost.png")]
+
+
+def write(path, format, estimates):
+    with Sink(str(path), format) as sink:
+        for estimate in estimates:
+            sink.write(estimate)
+    return path.read_text()
+
+
+def test_json_lines_are_the_record(tmp_path, estimates):
+    lines = write(tmp_path / "a.jsonl", "jsonl", estimates).splitlines()
+    for line, estimate in zip(lines, estimates, strict=True):
+        record = json.loads(line)
+        assert list(record) == [
+            "seq",
+            "stamp_ns",
+            "source",
+            "status",
+            "reasons",
+            "pose",
+            "interval",
+            "latency_ms",
+        ]
+        if estimate.pose is not None:
+            assert record["interval"]["lower"] == estimate.lower.tolist()
+            assert record["pose"]["q_xyzw"] == estimate.pose.q_xyzw.tolist()
+    lost = json.loads(lines[-1])
+    assert (lost["status"], lost["pose"], lost["interval"]) == ("invalid", None, None)
+    assert lost["reasons"] == ["image_unreadable"]
+
+
+def test_csv_holds_the_same_numbers(tmp_path, estimates):
+    rows = list(csv.DictReader(write(tmp_path / "a.csv", "csv", estimates).splitlines()))
+    assert len(rows) == len(estimates)
+    first = estimates[0]
+    assert [float(rows[0][f"{dof}_lower"]) for dof in first.chart.dof] == first.lower.tolist()
+    assert float(rows[0]["ty_m"]) == first.pose.t_m[1]
+    assert rows[-1]["tx_m"] == ""
+    assert rows[-1]["reasons"] == "image_unreadable"
+
+
+def test_tum_has_eight_columns_and_skips_what_has_no_pose(tmp_path, estimates):
+    lines = write(tmp_path / "a.txt", "tum", estimates).splitlines()
+    assert len(lines) == 3
+    assert all(len(line.split()) == 8 for line in lines)
+    assert lines[1].split()[0] == "0.033333333"
+    np.testing.assert_allclose(
+        [float(value) for value in lines[1].split()[1:]], estimates[1].pose.to_array(), atol=1e-9
+    )
+
+
+def test_tum_without_stamps_is_refused(tmp_path, bundle_dir, clip_dir):
+    frame = next(iter(open_source(str(clip_dir))))
+    with Odometer.load(bundle_dir) as odometer:
+        estimate = odometer.step(frame.image)
+    with Sink(str(tmp_path / "a.txt"), "tum") as sink, pytest.raises(UsageError, match="--fps"):
+        sink.write(estimate)
+
+
+def test_table_says_unbounded_in_words(tmp_path, estimates):
+    wide = [dataclasses.replace(estimates[0], region=unbounded_set())]
+    assert write(tmp_path / "a.txt", "table", wide).count("unbounded") == 6
+
+
+def test_a_file_that_cannot_be_opened_is_a_sink_error(tmp_path):
+    with pytest.raises(SinkError, match="cannot be written"):
+        Sink(str(tmp_path / "none" / "a.jsonl"), "jsonl")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_a_full_disk_is_a_sink_error(estimates):
+    with Sink("/dev/full", "jsonl") as sink, pytest.raises(SinkError, match="No space left"):
+        sink.write(estimates[0])

@@ -1,0 +1,143 @@
+"""Sources: order, damage, ends, stamps."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.sources import Video, decode_image, open_source
+
+
+def picture(value=0, height=48, width=64):
+    image = np.random.default_rng(value).integers(0, 255, (height, width, 3)).astype(np.uint8)
+    return cv2.GaussianBlur(image, (0, 0), 2)
+
+
+def write(path, value=0):
+    assert cv2.imwrite(str(path), picture(value))
+    return path
+
+
+def names(source):
+    return [frame.source for frame in source]
+
+
+def test_folder_is_in_natural_order(tmp_path):
+    for name in ("frame-10.png", "frame-9.png", "frame-100.png"):
+        write(tmp_path / name)
+    (tmp_path / "notes.txt").write_text("no image")
+    assert names(open_source(str(tmp_path))) == ["frame-9.png", "frame-10.png", "frame-100.png"]
+
+
+def test_colour_images_alone_where_there_are_any_and_never_depth(tmp_path):
+    write(tmp_path / "frame-1.depth.png")
+    write(tmp_path / "other.png")
+    assert names(open_source(str(tmp_path))) == ["other.png"]
+    write(tmp_path / "frame-1.color.png")
+    assert names(open_source(str(tmp_path))) == ["frame-1.color.png"]
+
+
+def test_glob_and_single_file(tmp_path):
+    for value in range(3):
+        write(tmp_path / f"{value}.png", value)
+    assert names(open_source(str(tmp_path / "[01].png"))) == ["0.png", "1.png"]
+    assert names(open_source(str(tmp_path / "2.png"))) == ["2.png"]
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_file_cut_anywhere_is_unreadable_and_its_neighbours_are_not(tmp_path, suffix):
+    for value in range(3):
+        write(tmp_path / f"{value}{suffix}", value)
+    middle = tmp_path / f"1{suffix}"
+    whole = middle.read_bytes()
+    for kept in (0, 1, 10, len(whole) // 2, len(whole) - 3):
+        middle.write_bytes(whole[:kept])
+        frames = list(open_source(str(tmp_path)))
+        assert [frame.image is None for frame in frames] == [False, True, False], kept
+
+
+def test_a_decoded_image_is_what_opencv_reads_without_exif_rotation(tmp_path):
+    path = write(tmp_path / "a.png")
+    np.testing.assert_array_equal(decode_image(path.read_bytes()), cv2.imread(str(path)))
+    assert decode_image(b"") is None
+    assert decode_image(b"\xff\xd8 no jpeg \xff\xd9") is None
+
+
+def test_stamps_are_integer_nanoseconds_from_zero(tmp_path):
+    for value in range(3):
+        write(tmp_path / f"{value}.png", value)
+    assert [frame.stamp_ns for frame in open_source(str(tmp_path), fps=30)] == [
+        0,
+        33_333_333,
+        66_666_667,
+    ]
+    assert [frame.stamp_ns for frame in open_source(str(tmp_path))] == [None] * 3
+
+
+@pytest.mark.parametrize("text", ["/no/such/place", "/no/such/*.png"])
+def test_what_is_not_there_is_refused(text):
+    with pytest.raises(SourceError, match="/no/such"):
+        open_source(text)
+
+
+def test_an_empty_folder_is_refused(tmp_path):
+    with pytest.raises(SourceError, match="expected images, found none"):
+        open_source(str(tmp_path))
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf")])
+def test_fps_must_be_positive(tmp_path, fps):
+    with pytest.raises(UsageError, match="fps"):
+        open_source(str(tmp_path), fps)
+
+
+@pytest.fixture
+def video(tmp_path):
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no video")
+    for value in range(20):
+        writer.write(picture(value))
+    writer.release()
+    return path
+
+
+def test_video_frames_and_stamps(video):
+    frames = list(open_source(str(video)))
+    assert len(frames) == 20
+    assert frames[1].stamp_ns == 50_000_000
+    assert frames[0].source == "clip.avi#0"
+    assert frames[0].image.shape == (48, 64, 3)
+
+
+def test_a_video_cut_short_is_told_after_its_frames(video):
+    content = video.read_bytes()
+    video.write_bytes(content[: len(content) // 2])
+    source = open_source(str(video))
+    assert isinstance(source, Video)
+    seen = []
+    with pytest.raises(SourceError, match=r"ended early: \d+ of 20"):
+        seen.extend(source)
+    if not seen:
+        for frame in open_source(str(video)):
+            seen.append(frame)
+            if len(seen) == 3:
+                break
+    assert seen
+
+
+def test_a_text_file_is_no_video(tmp_path):
+    path = tmp_path / "video.avi"
+    path.write_text("not a video")
+    with pytest.raises(SourceError, match="expected a video"):
+        open_source(str(path))
+
+
+def test_a_camera_that_is_not_there_is_refused():
+    if Path("/dev/video63").exists():
+        pytest.skip("this machine has 64 cameras")
+    with pytest.raises(SourceError, match="63"):
+        open_source("63")

@@ -1,0 +1,54 @@
+"""One tiny run, trained once: random weights, small images, a few hundred steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cvo_export.augment import AugmentConfig
+from cvo_export.backbone import BackboneConfig
+from cvo_export.publish import publish
+from cvo_export.run import Run, TrainConfig
+from cvo_export.train import train
+
+DATASET = "synthetic:room,flights=8,frames=40,size=64x48"
+
+
+def tiny_config(**changes: Any) -> TrainConfig:
+    values: dict[str, Any] = {
+        "method": "cjp",
+        "dataset": DATASET,
+        "split": "random",
+        "height": 48,
+        "width": 64,
+        "backbone": BackboneConfig(stages=("16",), grid=(3, 4)),
+        "weights": "none",
+        "augment": AugmentConfig(2.0, 0.5),
+        "copies": 2,
+        "steps": 240,
+        "warm_up_steps": 20,
+    }
+    return TrainConfig(**{**values, **changes})
+
+
+def ignore_progress(what: str, done: int, total: int) -> None:
+    """Nobody watches."""
+
+
+@pytest.fixture(scope="session")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("runs") / "tiny"
+
+
+@pytest.fixture(scope="session")
+def tiny_run(run_dir: Path) -> Run:
+    return train(run_dir, tiny_config(), ignore_progress)
+
+
+@pytest.fixture(scope="session")
+def tiny_bundle(tiny_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bundles") / "tiny"
+    publish(tiny_run, folder, "tiny")
+    return folder

@@ -1,0 +1,158 @@
+"""Evaluation: keys, bands, gates, and agreement with the odometer frame by frame."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from cvo_edge import Odometer
+from cvo_edge.errors import CvoError, GateError, SourceError
+from cvo_export.cli import app
+from cvo_export.datasets import open_dataset
+from cvo_export.evaluate import check_coverage, coverage_band, evaluate, find_level, table
+
+from .conftest import DATASET
+
+CVO_EXPORT = [sys.executable, "-c", "from cvo_export.cli import main; main()"]
+
+
+@pytest.fixture(scope="module")
+def report(tiny_bundle, tiny_run):
+    return evaluate(tiny_bundle, tiny_run.dataset, "test")
+
+
+def test_report_has_the_documented_keys(report):
+    for key in ("method", "dataset", "subset", "frames", "point_error", "levels", "sequences"):
+        assert key in report
+    assert set(report["frames"]) == {"total", "bounded", "degraded", "invalid"}
+    assert set(report["point_error"]) == {"median_m", "median_deg", "p90_m", "p90_deg"}
+    assert len(report["levels"]) == 10
+    for level in report["levels"]:
+        for key in (
+            "confidence",
+            "scope",
+            "coverage",
+            "coverage_bounded",
+            "coverage_band",
+            "joint_coverage",
+            "mean_width",
+            "median_width",
+            "interval_score",
+            "normalised_interval_score",
+            "unbounded_share",
+        ):
+            assert key in level
+    json.dumps(report, allow_nan=False)
+
+
+def test_coverage_and_width_are_those_of_the_odometer(report, tiny_bundle, tiny_run):
+    level = find_level(report["levels"], 0.9, "marginal")
+    covered, widths = [], []
+    with Odometer.load(tiny_bundle) as odometer:
+        for index in tiny_run.split.roles["test"].tolist():
+            estimate = odometer.step(tiny_run.dataset.read_image(index))
+            covered.append(estimate.covers(tiny_run.dataset.poses[index]))
+            widths.append(estimate.upper - estimate.lower)
+    np.testing.assert_allclose(level["coverage"], np.mean(covered, axis=0))
+    np.testing.assert_allclose(level["mean_width"], np.mean(widths, axis=0))
+    assert level["joint_coverage"] == pytest.approx(np.mean(np.all(covered, axis=1)))
+
+
+def test_unbounded_levels_count_the_workspace(report):
+    level = find_level(report["levels"], 0.99, "marginal")
+    assert level["unbounded_share"] == 1.0
+    assert level["coverage"] == [1.0] * 6
+    assert level["coverage_bounded"] is None
+    assert level["coverage_band"] is None
+    assert np.isfinite(level["interval_score"]).all()
+
+
+@pytest.mark.parametrize(
+    ("n", "n_test", "confidence"), [(64, 64, 0.9), (200, 200, 0.8), (19, 50, 0.9)]
+)
+def test_the_band_holds_ninety_nine_percent_of_simulated_coverages(n, n_test, confidence):
+    generator = np.random.default_rng(n)
+    k = int(np.ceil((n + 1) * confidence - 1e-9))
+    q_hat = np.sort(generator.random((20_000, n)), axis=1)[:, k - 1]
+    coverage = generator.binomial(n_test, q_hat) / n_test
+    low, high = coverage_band(n, n_test, confidence)
+    inside = np.mean((low <= coverage) & (coverage <= high))
+    assert 0.987 < inside < 1.0
+    assert coverage_band(8, 100, 0.9) is None
+
+
+def test_another_data_set_is_refused_for_test_but_not_for_all(tiny_bundle):
+    other = open_dataset("synthetic:room,flights=2,frames=10,size=64x48,seed=9")
+    with pytest.raises(SourceError, match="--subset all"):
+        evaluate(tiny_bundle, other, "test")
+    assert evaluate(tiny_bundle, other, "all")["frames"]["total"] == 20
+
+
+def test_coverage_gate(report):
+    check_coverage(report, 0.3)
+    with pytest.raises(GateError, match="expected coverage of at least 1"):
+        check_coverage(report, 1.01)
+
+
+def test_table_shows_every_level(report):
+    text = "\n".join(table(report))
+    assert text.count("marginal") == 5
+    assert text.count("joint ") >= 5
+    assert "unbounded" in text
+
+
+def cvo_export(*arguments):
+    command = [*CVO_EXPORT, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_command_line_trains_publishes_and_evaluates(tmp_path):
+    run, bundle = tmp_path / "run", tmp_path / "bundle"
+    trained = cvo_export(
+        *("train", "cjp", DATASET, run, "--split", "sequence", "--weights", "none"),
+        *("--size", "64x48", "--copies", 1, "--steps", 100),
+    )
+    assert trained.returncode == 0, trained.stderr
+    assert trained.stdout == ""
+    assert "best        val score" in trained.stderr
+    published = cvo_export("publish", run, bundle)
+    assert published.returncode == 0, published.stderr
+    assert "hierarchical" in published.stdout
+    evaluated = cvo_export("evaluate", bundle, DATASET, "--json", tmp_path / "report.json")
+    assert evaluated.returncode == 0, evaluated.stderr
+    assert "pooled rule" in evaluated.stdout
+    assert json.loads((tmp_path / "report.json").read_text())["other_rule"]["rule"] == "pooled"
+
+
+def test_a_failed_gate_is_exit_8_with_the_report_still_written(tiny_bundle):
+    gated = cvo_export("evaluate", tiny_bundle, DATASET, "--min-coverage", 1.0, "--json", "-")
+    assert gated.returncode == 8
+    assert json.loads(gated.stdout)["method"] == "cjp"
+    assert gated.stderr.startswith("cvo-export: evaluate: expected coverage of at least 1")
+    assert len(gated.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        ("train cjp nowhere RUN", 2),
+        ("train cjp 7scenes:/no/such RUN", 6),
+        ("train cjp DATASET RUN --weights /no/such/file", 2),
+        ("train cjp DATASET RUN --weights none --size 64", 2),
+        ("train cjp DATASET RUN --weights none --stages 7", 2),
+        ("train cjp DATASET RUN --weights none --grid 99x99", 2),
+        ("train cjp DATASET TINY --weights none", 2),
+        ("publish RUN BUNDLE", 2),
+        ("evaluate RUN DATASET", 3),
+        ("render DATASET RUN --sequence flight-99", 2),
+        ("render DATASET TINY --sequence flight-01", 7),
+    ],
+)
+def test_a_refusal_is_one_line_with_its_exit_code(tmp_path, run_dir, tiny_run, arguments, code):
+    named = {"DATASET": DATASET, "RUN": tmp_path / "run", "TINY": run_dir, "BUNDLE": tmp_path / "b"}
+    with pytest.raises(CvoError) as caught:
+        app([str(named.get(word, word)) for word in arguments.split()], standalone_mode=False)
+    assert caught.value.exit_code == code
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,112 @@
+"""From run to bundle: parity, thresholds through the runtime, all or nothing."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+
+from cvo_edge import Odometer, SinkError, UsageError
+from cvo_edge.artifact import read_bundle, read_calibration
+from cvo_edge.conformal import conformal_quantile
+from cvo_edge.errors import GateError
+from cvo_edge.selftest import check_selftest
+from cvo_edge.session import Session
+from cvo_export.calibrate import CONFIDENCES, observe
+from cvo_export.heads.cjp import CjpConfig
+from cvo_export.publish import publish
+from cvo_export.to_onnx import check_parity
+from cvo_export.train import train
+
+from .conftest import ignore_progress, tiny_config
+
+
+def test_a_fresh_bundle_passes_its_own_self_test(tiny_bundle):
+    with Odometer.load(tiny_bundle) as odometer:
+        assert check_selftest(odometer) < odometer.calibration.selftest.tolerance
+
+
+def test_thresholds_are_order_statistics_of_the_runtimes_scores(tiny_bundle, tiny_run):
+    with Odometer.load(tiny_bundle) as odometer:
+        seen = observe(odometer, tiny_run.dataset, tiny_run.split.roles["cal"])
+        scores = odometer.head.scores(seen.outputs, seen.point, seen.truth)
+        for confidence in CONFIDENCES:
+            stored = odometer.calibration.threshold(confidence, "marginal").q_hat
+            for dof in range(6):
+                expected = conformal_quantile(scores[:, dof], confidence)
+                assert stored[dof] == (expected if np.isfinite(expected) else None)
+
+
+def test_too_few_frames_are_unbounded_not_the_maximum(tiny_bundle):
+    calibration = read_calibration(tiny_bundle)
+    assert calibration.calibration.n == 64
+    assert calibration.threshold(0.99, "marginal").q_hat == (None,) * 6
+    assert calibration.threshold(0.99, "joint").q_hat == (None,) * 6
+    assert None not in calibration.threshold(0.95, "marginal").q_hat
+
+
+def test_both_scopes_and_all_confidences_are_stored(tiny_bundle):
+    calibration = read_calibration(tiny_bundle)
+    for scope in ("marginal", "joint"):
+        assert calibration.confidences(scope) == CONFIDENCES
+
+
+def test_nothing_but_two_files_and_no_path_in_them(tiny_bundle, tiny_run):
+    assert sorted(path.name for path in tiny_bundle.iterdir()) == ["calibration.json", "model.onnx"]
+    for path in tiny_bundle.iterdir():
+        content = path.read_bytes()
+        assert b"/home/" not in content
+        assert b"site-packages" not in content
+    assert "/" not in json.dumps(msgspec.to_builtins(read_calibration(tiny_bundle).provenance))
+
+
+def test_torch_and_the_graph_agree_and_another_graph_does_not(tiny_bundle, tiny_run):
+    session = Session(read_bundle(tiny_bundle).model_bytes)
+    image = np.random.default_rng(0).integers(0, 255, (1, 48, 64, 3)).astype(np.uint8)
+    assert check_parity(tiny_run.graph, session, [{"image": image}], ["image"]) < 1e-4
+    tiny_run.graph.mean += 1.0
+    try:
+        with pytest.raises(GateError, match="agree"):
+            check_parity(tiny_run.graph, session, [{"image": image}], ["image"])
+    finally:
+        tiny_run.graph.mean -= 1.0
+
+
+def test_a_bundle_is_replaced_whole_and_anything_else_is_refused(tiny_run, tiny_bundle, tmp_path):
+    target = tmp_path / "bundle"
+    publish(tiny_run, target, "first")
+    publish(tiny_run, target, "second", "hierarchical")
+    assert read_calibration(target).name == "second"
+    assert read_calibration(target).calibration.rule == "hierarchical"
+    assert [path.name for path in tmp_path.iterdir()] == ["bundle"]
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "precious.txt").write_text("keep")
+    with pytest.raises(SinkError, match="expected a new folder"):
+        publish(tiny_run, other, "third")
+    assert [path.name for path in other.iterdir()] == ["precious.txt"]
+
+
+def test_sampled_latent_is_an_input_and_its_noise_a_function_of_the_frame(tmp_path):
+    head = CjpConfig(latent_size=3, latent="sample")
+    run = train(tmp_path / "run", tiny_config(steps=100, head=head), ignore_progress)
+    publish(run, tmp_path / "bundle", "sampled")
+    image = run.dataset.read_image(0)
+    with Odometer.load(tmp_path / "bundle") as first, Odometer.load(tmp_path / "bundle") as again:
+        assert [spec.name for spec in first.session.inputs] == ["image", "latent_noise"]
+        a, b, c = first.step(image), first.step(image), again.step(image)
+    np.testing.assert_array_equal(a.lower, c.lower)
+    assert (a.lower != b.lower).any()
+
+
+def test_codebook_latent_needs_the_image_alone(tmp_path):
+    head = CjpConfig(latent_size=3, latent="codebook")
+    run = train(tmp_path / "run", tiny_config(steps=100, head=head), ignore_progress)
+    publish(run, tmp_path / "bundle", "codebook")
+    with Odometer.load(tmp_path / "bundle") as odometer:
+        assert [spec.name for spec in odometer.session.inputs] == ["image"]
+
+
+def test_no_frame_that_passes_is_a_usage_error(tiny_bundle, tiny_run):
+    with Odometer.load(tiny_bundle) as odometer, pytest.raises(UsageError, match="found none of 2"):
+        observe(odometer, tiny_run.dataset, np.array([0, 1]), lambda _: np.zeros((1, 1), np.uint8))

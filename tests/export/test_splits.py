@@ -1,0 +1,107 @@
+"""No frame has two roles; gaps, shares, sequences and digests."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cvo_edge.errors import SourceError, UsageError
+from cvo_export.datasets import PoseDataset
+from cvo_export.splits import ROLES, SHARES, default_kind, make_split, same_split
+
+
+def dataset(lengths, own_train=(), own_test=(), prefix="f"):
+    n = sum(lengths)
+    sequence = np.repeat(np.arange(len(lengths)), lengths)
+    return PoseDataset(
+        name="made",
+        poses=np.tile([0, 0, 0, 0, 0, 0, 1.0], (n, 1)),
+        sequence=sequence,
+        sequence_names=tuple(f"s{i}" for i in range(len(lengths))),
+        frame_names=tuple(f"{prefix}{i}" for i in range(n)),
+        read_image=lambda _: np.zeros((48, 64, 3), np.uint8),
+        own_train=frozenset(own_train),
+        own_test=frozenset(own_test),
+    )
+
+
+@settings(max_examples=40)
+@given(
+    st.lists(st.integers(60, 120), min_size=5, max_size=12),
+    st.sampled_from(["random", "block", "sequence"]),
+    st.integers(0, 10),
+)
+def test_no_frame_has_two_roles_and_every_role_has_frames(lengths, kind, seed):
+    made = dataset(lengths)
+    try:
+        split = make_split(made, kind, seed)
+    except UsageError:
+        assert kind == "block"  # short recordings may not survive the gaps
+        return
+    joined = np.concatenate([split.roles[role] for role in ROLES])
+    assert len(set(joined.tolist())) == joined.size
+    assert all(split.roles[role].size for role in ROLES)
+    if kind == "random":
+        assert joined.size == len(made)
+
+
+def test_random_shares_are_exact_on_a_thousand_frames():
+    split = make_split(dataset([1000]), "random", 0)
+    assert [split.roles[role].size for role in ROLES] == [400, 100, 100, 200, 200]
+    assert sum(SHARES.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_block_leaves_fifteen_frames_between_roles(seed):
+    split = make_split(dataset([1000]), "block", seed)
+    role_of = np.full(1000, -1)
+    for number, role in enumerate(ROLES):
+        role_of[split.roles[role]] = number
+    last_role, last_index = -1, -100
+    for index in np.flatnonzero(role_of >= 0).tolist():
+        if role_of[index] != last_role:
+            assert index - last_index > 15
+        last_role, last_index = role_of[index], index
+    assert (role_of >= 0).sum() >= 600
+
+
+def test_block_refuses_a_recording_that_would_not_survive():
+    with pytest.raises(UsageError, match="too short"):
+        make_split(dataset([200]), "block", 0)
+
+
+def test_sequence_keeps_sequences_whole_and_respects_the_own_test_list():
+    made = dataset([50] * 48, own_train=range(36), own_test=range(36, 48))
+    split = make_split(made, "sequence", 1)
+    by_role = {role: set(made.sequence[split.roles[role]].tolist()) for role in ROLES}
+    assert by_role["test"] == set(range(36, 48))
+    assert [len(by_role[role]) for role in ROLES] == [18, 4, 3, 11, 12]
+    assert all(split.roles[role].size == 50 * len(by_role[role]) for role in ROLES)
+
+
+def test_sequence_without_lists_gives_enough_calibration_sequences():
+    made = dataset([10] * 48)
+    split = make_split(made, "sequence", 0)
+    assert len(set(made.sequence[split.roles["cal"]].tolist())) >= 11
+
+
+def test_too_few_sequences_name_the_empty_role():
+    with pytest.raises(UsageError, match="found none for"):
+        make_split(dataset([50] * 3), "sequence", 0)
+    assert default_kind(dataset([50] * 3)) == "block"
+    assert default_kind(dataset([50] * 5)) == "sequence"
+
+
+@pytest.mark.parametrize("kind", ["random", "block", "sequence"])
+def test_the_same_seed_gives_the_same_split_and_another_another(kind):
+    made = dataset([150] * 8)
+    first, again, other = (make_split(made, kind, seed) for seed in (3, 3, 4))
+    assert first.digest(made) == again.digest(made) != other.digest(made)
+    assert same_split(made, kind, 3, first.digest(made)).kind == kind
+
+
+def test_another_data_set_is_not_taken_for_the_recorded_one():
+    made, renamed = dataset([1000]), dataset([1000], prefix="g")
+    digest = make_split(made, "random", 0).digest(made)
+    with pytest.raises(SourceError, match="another data set"):
+        same_split(renamed, "random", 0, digest)

@@ -1,0 +1,103 @@
+"""Training: reproducible, resumable to the bit, and refusing what is another run's."""
+
+import numpy as np
+import pytest
+import torch
+
+from cvo_edge.errors import UsageError
+from cvo_export.run import load_run
+from cvo_export.target import MAX_SPREAD_RAD, fit_target
+from cvo_export.train import train
+
+from .conftest import ignore_progress, tiny_config
+
+
+def same_weights(first, second):
+    a, b = first.graph.state_dict(), second.graph.state_dict()
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+class InterruptedTrainingError(Exception):
+    pass
+
+
+def stopping_after(calls, wanted):
+    left = [calls]
+
+    def progress(what, done, total):
+        if what.startswith(wanted):
+            left[0] -= 1
+            if left[0] < 0:
+                raise InterruptedTrainingError
+
+    return progress
+
+
+def test_the_same_seed_gives_the_same_weights(tiny_run, tmp_path):
+    again = train(tmp_path / "again", tiny_config(), ignore_progress)
+    assert same_weights(tiny_run, again)
+    assert tiny_run.history == again.history
+
+
+def test_training_lowers_the_score_on_val(tiny_run):
+    scores = [entry["val_score"] for entry in tiny_run.history]
+    assert min(scores) < 0.7 * scores[0]
+
+
+@pytest.mark.parametrize(("calls", "wanted"), [(1, "features"), (0, "head"), (17, "head")])
+def test_an_interrupted_run_ends_as_if_it_never_was(tiny_run, tmp_path, calls, wanted):
+    folder = tmp_path / "broken"
+    with pytest.raises(InterruptedTrainingError):
+        train(folder, tiny_config(), stopping_after(calls, wanted))
+    resumed = train(folder, tiny_config(), ignore_progress)
+    assert same_weights(tiny_run, resumed)
+    assert tiny_run.history == resumed.history
+
+
+def test_fine_tuning_is_resumable_and_changes_the_backbone(tmp_path):
+    config = tiny_config(fine_tune=1, steps=100)
+    whole = train(tmp_path / "whole", config, ignore_progress)
+    with pytest.raises(InterruptedTrainingError):
+        train(tmp_path / "broken", config, stopping_after(3, "fine-tuning"))
+    resumed = train(tmp_path / "broken", config, ignore_progress)
+    assert same_weights(whole, resumed)
+    frozen = train(tmp_path / "frozen", tiny_config(steps=100), ignore_progress)
+    stem = "backbone.body.conv_stem.weight"
+    assert not torch.equal(whole.graph.state_dict()[stem], frozen.graph.state_dict()[stem])
+
+
+def test_a_run_folder_of_other_options_is_refused(tiny_run, run_dir):
+    with pytest.raises(UsageError, match="found another run"):
+        train(run_dir, tiny_config(seed=1), ignore_progress)
+
+
+def test_a_finished_run_is_read_back(tiny_run, run_dir):
+    assert same_weights(tiny_run, load_run(run_dir))
+
+
+def test_an_unfinished_run_cannot_be_published(tmp_path):
+    with pytest.raises(UsageError, match="finished run"):
+        load_run(tmp_path)
+
+
+@pytest.mark.parametrize("latent", ["codebook", "sample"])
+def test_the_papers_choices_train(tmp_path, latent):
+    config = tiny_config(steps=100)
+    head = type(config.head)(latent_size=3, latent=latent, gate="literal", bounds="free")
+    run = train(tmp_path / "run", tiny_config(steps=100, head=head), ignore_progress)
+    assert np.isfinite(run.history[-1]["loss"])
+
+
+def test_rotations_too_wide_for_one_tangent_are_refused():
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    poses = np.zeros((40, 7))
+    poses[:, :3] = np.random.default_rng(0).standard_normal((40, 3))
+    poses[:, 5], poses[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
+    with pytest.raises(UsageError, match=f"{MAX_SPREAD_RAD:g} rad"):
+        fit_target(poses)
+
+
+def test_a_degree_of_freedom_that_never_moves_is_refused():
+    poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (10, 1))
+    with pytest.raises(UsageError, match="motion in every degree of freedom"):
+        fit_target(poses)
