@@ -13,8 +13,12 @@ from typing import Annotated, NoReturn
 
 # numpy's thread pool would double the memory of a process that does no linear algebra in it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# OpenCV and its FFmpeg write warnings of their own to stderr; what matters of them, we say.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 import typer
+from typer.main import get_command
 
 from cvo_edge.errors import CvoError, GateError, SinkError, SourceError
 
@@ -228,7 +232,7 @@ def write_text(target: str, text: str) -> None:
         raise SinkError(f"{target}: cannot be written: {error.strerror}") from None
 
 
-def guarded(program: str, command: typer.Typer) -> NoReturn:
+def guarded(program: str, app: typer.Typer) -> NoReturn:
     """Run a command line and leave with the documented exit code.
 
     One line on stderr for every error from outside; a reader of stdout that has left ends it
@@ -236,9 +240,15 @@ def guarded(program: str, command: typer.Typer) -> NoReturn:
     through here.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    command = get_command(app)
     try:
-        code = command(args=sys.argv[1:] or ["--help"], standalone_mode=False) or 0
+        # Not command.main(): it has exit codes of its own for signals and closed pipes.
+        with command.make_context(program, sys.argv[1:] or ["--help"]) as context:
+            command.invoke(context)
         sys.stdout.flush()
+        code = 0
+    except typer.Exit as leaving:
+        code = leaving.exit_code
     except CvoError as error:
         print(f"{program}: {error}", file=sys.stderr)
         code = error.exit_code
@@ -246,6 +256,7 @@ def guarded(program: str, command: typer.Typer) -> NoReturn:
         print(f"{program}: {error.format_message().strip()}", file=sys.stderr)
         code = error.exit_code
     except BrokenPipeError:
+        # Python flushes stdout once more at exit; without this it would complain then.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     except KeyboardInterrupt:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cvo_edge import geometry, preprocess
+from cvo_edge import preprocess
 from cvo_edge.artifact import Bundle, Threshold, read_bundle
 from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.heads import HEADS
@@ -219,8 +220,13 @@ class Odometer:
         if not all(np.isfinite(output).all() for output in outputs.values()):
             fault = Reason.OUTPUT_NOT_FINITE
         else:
-            pose[3:] = geometry.quaternion_normalise(pose[3:])
-            point = self.chart.coordinates(pose, pose)
+            length = math.hypot(*pose[3:].tolist())
+            if length > 0.0:
+                # Unit, and of the two quaternions of a rotation the one with qw >= 0.
+                pose[3:] /= math.copysign(length, pose[6])
+            else:
+                pose[3:] = math.nan
+            point = self.chart.point(pose)
             # Written so that NaN (a zero quaternion) fails the check.
             if not ((self._lowest <= point) & (point <= self._highest)).all():
                 fault = Reason.POSE_IMPLAUSIBLE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -118,6 +119,27 @@ class Chart:
             q_base_inverse = geometry.quaternion_conjugate(q_base)
             turn = geometry.quaternion_log(geometry.quaternion_multiply(q_base_inverse, p[..., 3:]))
         return np.concatenate(np.broadcast_arrays(p[..., :3], turn), axis=-1)
+
+    def point(self, pose: Array) -> Array:
+        """``coordinates(pose, pose)`` of one pose (7,), in a tenth of the time.
+
+        On the way of every frame, where a call into numpy costs more than the arithmetic in it.
+        """
+        if self.rotation == "euler_zyx":
+            return self.coordinates(pose, pose)
+        tx, ty, tz, x, y, z, w = pose.tolist()
+        if self.reference_q_xyzw is None:
+            return np.array((tx, ty, tz, 0.0, 0.0, 0.0))
+        a, b, c, d = self.reference_q_xyzw.tolist()
+        # Vector and scalar part of conj(reference) * q; the log takes the shorter way round.
+        rx = d * x - a * w - b * z + c * y
+        ry = d * y + a * z - b * w - c * x
+        rz = d * z - a * y + b * x - c * w
+        rw = d * w + a * x + b * y + c * z
+        sine = math.sqrt(rx * rx + ry * ry + rz * rz)
+        angle = 2.0 * math.atan2(sine, abs(rw))
+        factor = math.copysign(angle / sine if sine > 1e-8 else 2.0, rw)
+        return np.array((tx, ty, tz, factor * rx, factor * ry, factor * rz))
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,8 +53,12 @@ class Session:
     def __init__(
         self, model_bytes: bytes, threads: int | None = None, expected: ModelSpec | None = None
     ) -> None:
-        if threads is not None and threads < 1:
-            raise UsageError(f"threads: expected at least 1, found {threads}")
+        present = os.cpu_count() or 1
+        # A thousand threads would not be refused by the engine, and take minutes a frame.
+        if threads is not None and not 1 <= threads <= present:
+            raise UsageError(
+                f"threads: expected 1 to {present}, the cores of this machine, found {threads}"
+            )
         self.threads = threads or allowed_cores()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads

@@ -6,7 +6,6 @@ what was calibrated.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -53,21 +52,15 @@ class Observed:
     flagged: int
 
 
-def observe(
-    odometer: Odometer,
-    dataset: PoseDataset,
-    indices: NDArray[np.int64],
-    read_image: Callable[[int], NDArray[np.uint8]] | None = None,
-) -> Observed:
+def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]) -> Observed:
     """Run frames of a data set through the odometer's network, in order.
 
     Raises UsageError where no frame passes the checks.
     """
-    read = read_image or dataset.read_image
     kept: list[int] = []
     seen: list[Observation] = []
     for index in indices.tolist():
-        observation = odometer.observe(read(index), seq=index)
+        observation = odometer.observe(dataset.read_image(index), seq=index)
         if observation.fault is None:
             kept.append(index)
             seen.append(observation)

@@ -64,7 +64,7 @@ def evaluate(
             "score": calibration.calibration.score,
             "frames": {
                 "total": len(indices),
-                "bounded": sets.bounded,
+                "bounded": _bounded(levels, len(seen.indices)),
                 "degraded": 0,
                 "invalid": seen.flagged,
             },
@@ -154,6 +154,12 @@ def table(report: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def _bounded(levels: list[dict[str, Any]], frames: int) -> int:
+    """Frames with finite bounds at the lowest stored confidence of all."""
+    lowest = min(levels, key=lambda level: level["confidence"])
+    return round((1.0 - float(lowest["unbounded_share"])) * frames)
+
+
 def _level_lines(rule: str, levels: list[dict[str, Any]]) -> list[str]:
     lines = [
         "",
@@ -198,12 +204,6 @@ class _Sets:
     @property
     def calibration(self) -> Calibration:
         return self.odometer.calibration
-
-    @property
-    def bounded(self) -> int:
-        """Frames with finite bounds at the first threshold of all that has them."""
-        finite = [all(q is not None for q in t.q_hat) for t in self.calibration.thresholds]
-        return len(self.seen.indices) if any(finite) else 0
 
     def inside(self, entry: Threshold) -> tuple[NDArray[np.bool_], Array, Array, NDArray[np.bool_]]:
         """Covered (n, 6), width (n, 6), distance (n, 6) and boundedness (n,) of every frame."""

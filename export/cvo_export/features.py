@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cvo_edge import preprocess
 from cvo_edge.errors import UsageError
-from cvo_edge.session import Session
+from cvo_edge.session import Session, allowed_cores
 from cvo_export.augment import AugmentConfig, augmented, model_intrinsics
 from cvo_export.backbone import Backbone
 from cvo_export.datasets import PoseDataset
@@ -64,7 +64,8 @@ class FeatureExtractor:
 
     def __init__(self, backbone: Backbone, height: int, width: int) -> None:
         blank = torch.zeros((1, height, width, 3), dtype=torch.uint8)
-        self._session = Session(export_onnx(backbone, [blank], ["image"], ["features"]))
+        # One thread each: several images at a time need no waiting for one another.
+        self._session = Session(export_onnx(backbone, [blank], ["image"], ["features"]), threads=1)
 
     def __call__(self, image: Image) -> NDArray[np.float32]:
         """Return the features of one image."""
@@ -89,9 +90,8 @@ def cached_copies(
     for number in range(copies + 1):
         path = folder / f"copy-{number:03d}.npz"
         if not path.is_file():
-            generator = np.random.default_rng((seed, number))
             graded = config.graded(number / max(1, copies))
-            found = _one_copy(images, extractor, graded, generator)
+            found = _one_copy(images, extractor, graded, (seed, number))
             partial = path.with_suffix(".partial")
             with partial.open("wb") as stream:
                 np.savez(stream, features=found[0], poses=found[1])
@@ -104,19 +104,14 @@ def cached_copies(
 
 
 def _one_copy(
-    images: ModelImages,
-    extractor: FeatureExtractor,
-    config: AugmentConfig,
-    generator: np.random.Generator,
+    images: ModelImages, extractor: FeatureExtractor, config: AugmentConfig, seed: tuple[int, int]
 ) -> tuple[NDArray[np.float16], Array]:
-    features, poses = [], []
-    # The next image is changed while the network looks at this one.
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        pending = pool.submit(images.augmented, 0, config, generator)
-        for row in range(len(images)):
-            image, pose = pending.result()
-            if row + 1 < len(images):
-                pending = pool.submit(images.augmented, row + 1, config, generator)
-            features.append(extractor(image).astype(np.float16))
-            poses.append(pose)
-    return np.stack(features), np.stack(poses)
+    def one(row: int) -> tuple[NDArray[np.float16], Array]:
+        # A generator of its own for each image: the result does not depend on the order.
+        image, pose = images.augmented(row, config, np.random.default_rng((*seed, row)))
+        return extractor(image).astype(np.float16), pose
+
+    # OpenCV and onnxruntime let other threads run, so whole images are the unit of work.
+    with ThreadPoolExecutor(max_workers=allowed_cores()) as pool:
+        found = list(pool.map(one, range(len(images))))
+    return np.stack([features for features, _ in found]), np.stack([pose for _, pose in found])

@@ -91,7 +91,7 @@ REFUSED = [
     (("pose", "limits", "lowest"), [9e9] * 6, "lowest < highest"),
     (("thresholds",), [], "thresholds"),
     (("thresholds", 0, "confidence"), 1.0, "confidence"),
-    (("thresholds", 0, "confidence"), 0.9, "each confidence once"),
+    (("thresholds", 0, "confidence"), 0.8, "each confidence once"),
     (("thresholds", 0, "q_hat"), [1, 2, 3], "q_hat"),
     (("thresholds", 0, "q_hat", 0), "1", "q_hat"),
     (("thresholds", 0, "q_hat", 0), 1e9, "growth with the confidence"),

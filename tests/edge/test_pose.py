@@ -51,6 +51,17 @@ def test_tangent_at_a_reference_gives_back_the_rotation_vector(t, v):
     np.testing.assert_allclose(found, [*t, *v], atol=1e-7)
 
 
+@pytest.mark.parametrize("rotation", ["tangent_reference", "tangent_predicted", "euler_zyx"])
+@given(translations, arrays(np.float64, 3, elements=st.floats(-1.8, 1.8)))
+def test_the_point_is_the_poses_own_coordinates(rotation, t, v):
+    reference = geometry.quaternion_exp([0.3, -0.2, 0.5])
+    chart = Chart(rotation, reference if rotation == "tangent_reference" else None)
+    pose = pose_at(t, v)
+    expected = chart.coordinates(pose, pose)
+    if np.linalg.norm(expected[3:]) < 3.14:  # at half a turn both ways are right
+        np.testing.assert_allclose(chart.point(pose), expected, atol=1e-9)
+
+
 def test_yaw_across_the_cut_is_near_the_prediction():
     chart = Chart("euler_zyx")
     at = [

@@ -1,5 +1,6 @@
 """From run to bundle: parity, thresholds through the runtime, all or nothing."""
 
+import dataclasses
 import json
 
 import msgspec
@@ -108,5 +109,6 @@ def test_codebook_latent_needs_the_image_alone(tmp_path):
 
 
 def test_no_frame_that_passes_is_a_usage_error(tiny_bundle, tiny_run):
+    blind = dataclasses.replace(tiny_run.dataset, read_image=lambda _: np.zeros((1, 1), np.uint8))
     with Odometer.load(tiny_bundle) as odometer, pytest.raises(UsageError, match="found none of 2"):
-        observe(odometer, tiny_run.dataset, np.array([0, 1]), lambda _: np.zeros((1, 1), np.uint8))
+        observe(odometer, blind, np.array([0, 1]))
