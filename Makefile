@@ -1,5 +1,7 @@
 # Each target does all of its own set-up: a fresh machine needs Python >= 3.11 with venv, pip and make.
 PYTHON ?= python3
+# Options for installing torch, e.g. the index of its CPU wheels.
+TORCH_PIP_OPTIONS ?=
 VENV := .venv
 DEMO_VENV := .venv-demo
 BUNDLE := calibration_artifacts/synthetic-room-cjp
@@ -21,8 +23,7 @@ $(DEMO_VENV)/.installed: pyproject.toml
 
 $(VENV)/.installed: pyproject.toml export/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	# torch first and by itself: on many machines the CPU build comes from an index of its own.
-	$(VENV)/bin/python -m pip install --quiet torch torchvision
+	$(VENV)/bin/python -m pip install --quiet $(TORCH_PIP_OPTIONS) torch torchvision
 	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable ./export
 	@touch $@
 

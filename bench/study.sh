@@ -11,7 +11,8 @@ dataset=7scenes:$CVO_DATA/$recording
 split=random
 [ "$recording" = kitchen_flights ] && split=sequence
 mkdir -p "$work"
-for seed in "${@:-0 1 2}"; do
+[ $# -gt 0 ] || set -- 0 1 2
+for seed in "$@"; do
   run=$work/$recording-$seed
   start=$(date +%s)
   cvo-export train cjp "$dataset" "$run" --split "$split" --seed "$seed" --weights "$weights"

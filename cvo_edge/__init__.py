@@ -9,20 +9,24 @@ with Odometer.load("bundle", confidence=0.9, scope="marginal") as odometer:
 
 from __future__ import annotations
 
-from cvo_edge.artifact import Bundle, Calibration, read_bundle
-from cvo_edge.errors import (
-    BundleMismatchError,
-    CalibrationFileError,
-    CvoError,
-    GateError,
-    ModelError,
-    SinkError,
-    SourceError,
-    UsageError,
-)
-from cvo_edge.odometer import Odometer
-from cvo_edge.pose import Chart, ConformalSet, Pose, PoseInterval, Reason, Status
-from cvo_edge.sources import Frame, open_source
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cvo_edge.artifact import Bundle, Calibration, read_bundle
+    from cvo_edge.errors import (
+        BundleMismatchError,
+        CalibrationFileError,
+        CvoError,
+        GateError,
+        ModelError,
+        SinkError,
+        SourceError,
+        UsageError,
+    )
+    from cvo_edge.odometer import Odometer
+    from cvo_edge.pose import Chart, ConformalSet, Pose, PoseInterval, Reason, Status
+    from cvo_edge.sources import Frame, open_source
 
 __version__ = "0.1.0"
 
@@ -48,3 +52,37 @@ __all__ = [
     "open_source",
     "read_bundle",
 ]
+
+_HOMES = {
+    "Bundle": "artifact",
+    "BundleMismatchError": "errors",
+    "Calibration": "artifact",
+    "CalibrationFileError": "errors",
+    "Chart": "pose",
+    "ConformalSet": "pose",
+    "CvoError": "errors",
+    "Frame": "sources",
+    "GateError": "errors",
+    "ModelError": "errors",
+    "Odometer": "odometer",
+    "Pose": "pose",
+    "PoseInterval": "pose",
+    "Reason": "pose",
+    "SinkError": "errors",
+    "SourceError": "errors",
+    "Status": "pose",
+    "UsageError": "errors",
+    "open_source": "sources",
+    "read_bundle": "artifact",
+}
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - the type is that of the name
+    """Import a public name when it is first asked for.
+
+    The command line sets up the environment of numpy and OpenCV first, and answers ``--version``
+    without either.
+    """
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -30,8 +30,13 @@ MODEL_FILE: Literal["model.onnx"] = "model.onnx"
 MAX_CALIBRATION_BYTES = 64 * 1024
 MAX_MODEL_BYTES = 1 << 30
 MAX_DEPTH = 16
+# Every bundle stores at least these, for both scopes.
+CONFIDENCES = (0.5, 0.8, 0.9, 0.95, 0.99)
 
-Text = Annotated[str, Meta(min_length=1, max_length=200)]
+# No control characters and no lone surrogates: texts are printed on terminals.
+Text = Annotated[
+    str, Meta(min_length=1, max_length=200, pattern="^[^\x00-\x1f\x7f-\x9f\ud800-\udfff]+$")
+]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 Positive = Annotated[float, Meta(gt=0)]
 Six = tuple[float, float, float, float, float, float]
@@ -80,7 +85,7 @@ class PreprocessSpec(_Strict, frozen=True):
     mean: tuple[float, float, float]
     std: tuple[Positive, Positive, Positive]
     layout: Literal["nhwc"]
-    in_graph: tuple[Literal["cast", "transpose", "normalise"], ...]
+    in_graph: tuple[Literal["cast"], Literal["transpose"], Literal["normalise"]]
 
 
 class PoseLimits(_Strict, frozen=True):
@@ -125,8 +130,8 @@ class CalibrationSpec(_Strict, frozen=True):
 
     score: Text
     rule: Literal["pooled", "hierarchical", "weighted"]
-    n: Annotated[int, Meta(ge=1)]
-    n_sequences: Annotated[int, Meta(ge=1)]
+    n: Annotated[int, Meta(ge=1, le=10**9)]
+    n_sequences: Annotated[int, Meta(ge=1, le=10**9)]
     n_effective: Positive
     split: SplitSpec
     dataset: Text
@@ -139,18 +144,18 @@ class SelfTest(_Strict, frozen=True):
     height: Annotated[int, Meta(ge=16, le=4096)]
     width: Annotated[int, Meta(ge=16, le=4096)]
     outputs: dict[Text, tuple[float, ...]]
-    tolerance: Positive
+    tolerance: Annotated[float, Meta(gt=0, le=1)]
 
 
 class Provenance(_Strict, frozen=True):
     """How the bundle was made: names and digests, never a path."""
 
-    created_with: dict[str, str]
+    created_with: dict[Text, Text]
     seed: Annotated[int, Meta(ge=0)]
     backbone: Text
     weights_sha256: Sha256 | None
     dataset: Text
-    options: dict[str, str | int | float | bool | None]
+    options: dict[Text, Text | int | float | bool | None]
 
 
 class Calibration(_Strict, frozen=True):
@@ -374,6 +379,13 @@ def _check_rules(calibration: Calibration) -> None:
 
 def _check_thresholds(thresholds: tuple[Threshold, ...]) -> None:
     for scope in ("marginal", "joint"):
+        stored = [entry.confidence for entry in thresholds if entry.scope == scope]
+        missing = [c for c in CONFIDENCES if not any(abs(c - found) < 1e-9 for found in stored)]
+        if missing:
+            raise CalibrationFileError(
+                f"thresholds: expected {', '.join(map(str, CONFIDENCES))} for scope {scope}, "
+                f"found none for {', '.join(map(str, missing))}"
+            )
         entries = sorted(
             (entry for entry in thresholds if entry.scope == scope), key=lambda e: e.confidence
         )

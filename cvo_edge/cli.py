@@ -20,7 +20,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import typer
 from typer.main import get_command
 
-from cvo_edge.errors import CvoError, GateError, SinkError, SourceError
+from cvo_edge.errors import CvoError, GateError, SinkError, SourceError, UsageError
 
 app = typer.Typer(
     add_completion=False,
@@ -88,12 +88,13 @@ def run(
     from cvo_edge.sources import open_source
     from cvo_edge.trajectory import open_ground_truth
 
+    _refuse_overwriting(output, Path(source), ground_truth, bundle)
     truth = open_ground_truth(ground_truth) if ground_truth else None
     with Odometer.load(
         bundle, threads=threads, confidence=confidence, scope=scope.value
     ) as odometer:
         frames = open_source(source, fps)
-        summary = RunSummary(odometer.chart.dof, confidence, scope)
+        summary = RunSummary(odometer.chart.dof, confidence, scope, with_truth=truth is not None)
         with Sink(output, format.value) as sink:
             try:
                 run_frames(
@@ -221,6 +222,20 @@ def _root(
     """Options that need no command."""
 
 
+def _refuse_overwriting(output: str, *inputs: Path | None) -> None:
+    """Raise UsageError where the output file is one of the inputs or lies in the bundle."""
+    written = Path(output)
+    if output == "-" or not written.exists():
+        return
+    for given in inputs:
+        if (
+            given is not None
+            and given.exists()
+            and (written.samefile(given) or any(written.samefile(p) for p in given.glob("*")))
+        ):
+            raise UsageError(f"output: expected a file of its own, found {output} among the input")
+
+
 def write_text(target: str, text: str) -> None:
     """Write text to a file, or to standard output for ``-``; raises SinkError."""
     if target == "-":
@@ -242,6 +257,8 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
     signal.signal(signal.SIGTERM, _terminate)
     command = get_command(app)
     try:
+        if sys.stdout is None:
+            raise SinkError("standard output: expected an open one, found it closed")
         # Not command.main(): it has exit codes of its own for signals and closed pipes.
         with command.make_context(program, sys.argv[1:] or ["--help"]) as context:
             command.invoke(context)
@@ -250,18 +267,34 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
     except typer.Exit as leaving:
         code = leaving.exit_code
     except CvoError as error:
-        print(f"{program}: {error}", file=sys.stderr)
-        code = error.exit_code
+        code = _complain(program, str(error), error.exit_code)
     except typer.TyperException as error:
-        print(f"{program}: {error.format_message().strip()}", file=sys.stderr)
-        code = error.exit_code
+        code = _complain(program, error.format_message().strip(), error.exit_code)
     except BrokenPipeError:
-        # Python flushes stdout once more at exit; without this it would complain then.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_stdout()
         code = 0
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
+    except OSError as error:
+        # What the modules did not foresee: a path too long, standard output on a full disk.
+        failed = SourceError if error.filename else SinkError
+        where = error.filename or "standard output"
+        code = _complain(program, f"{where}: {error.strerror}", failed.exit_code)
+        _drop_stdout()
     sys.exit(code)
+
+
+def _complain(program: str, message: str, code: int) -> int:
+    """One line on stderr, whatever a path or a key in the message holds."""
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+    if sys.stderr is not None:
+        print(f"{program}: {shown}", file=sys.stderr)
+    return code
+
+
+def _drop_stdout() -> None:
+    """Keep Python from complaining when it flushes a broken stdout once more at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _terminate(number: int, _: FrameType | None) -> NoReturn:

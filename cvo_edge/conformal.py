@@ -83,8 +83,9 @@ def interval_score(width: ArrayLike, distance: ArrayLike, alpha: float) -> Array
 def effective_sample_size(scores: ArrayLike) -> float:
     """How many independent draws scores (n,) in time order are worth: n / (1 + 2 sum rho_k).
 
-    rho_k is the autocorrelation at lag k; the sum ends before the first pair of neighbouring lags
-    whose correlations add up to no more than zero (initial positive sequence, Geyer 1992).
+    rho_k is the autocorrelation at lag k; the sum ends before the first pair of lags (2m, 2m + 1)
+    whose correlations add up to no more than zero (initial positive sequence, Geyer 1992). Never
+    more than n.
     """
     s = _checked(scores)
     n = s.size
@@ -95,13 +96,14 @@ def effective_sample_size(scores: ArrayLike) -> float:
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.fft.rfft(centred, size)
     rho = np.fft.irfft(spectrum * spectrum.conj(), size)[:n] / variance
-    total = 0.0
-    for lag in range(1, n - 1, 2):
+    pairs = 0.0
+    for lag in range(0, n - 1, 2):
         pair = float(rho[lag] + rho[lag + 1])
         if pair <= 0.0:
             break
-        total += pair
-    return float(n / max(1.0, 1.0 + 2.0 * total))
+        pairs += pair
+    # The first pair holds rho_0 = 1, which counts once.
+    return float(n / max(1.0, 2.0 * pairs - 1.0))
 
 
 def _checked(scores: ArrayLike) -> Array:

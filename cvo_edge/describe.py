@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from cvo_edge.artifact import Calibration
+from cvo_edge.artifact import Calibration, CalibrationSpec
 from cvo_edge.heads import HEADS
 from cvo_edge.pose import Chart
 
@@ -24,8 +24,8 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         f"tensors      {tensors}",
         f"pose         {pose.target}, {pose.child_frame_id} in {pose.frame_id}, {pose.rotation}",
         f"calibrated   on {source.n} frames of {source.n_sequences} sequence(s) of "
-        f"{source.dataset}, split {source.split.kind} (seed {source.split.seed}), {source.rule}; "
-        f"worth about {source.n_effective:.0f} independent frames",
+        f"{source.dataset}, split {source.split.kind} (seed {source.split.seed}), {source.rule}"
+        + _worth(source),
         f"backbone     {calibration.provenance.backbone}",
         "",
         f"{'q_hat at':<16}" + "".join(f"{name:>11}" for name in dof),
@@ -40,6 +40,13 @@ def inspect_lines(calibration: Calibration) -> list[str]:
     return lines
 
 
+def _worth(source: CalibrationSpec) -> str:
+    """Remark that frames of one recording are dependent; a random split deals that away."""
+    if source.split.kind == "random":
+        return ""
+    return f"; worth about {source.n_effective:.0f} independent frames"
+
+
 def doctor_lines(report: dict[str, Any]) -> list[str]:
     """Return the environment for a person."""
     versions = ", ".join(f"{name} {value}" for name, value in report["versions"].items())
@@ -48,6 +55,7 @@ def doctor_lines(report: dict[str, Any]) -> list[str]:
         f"cores        {report['cores_allowed']} allowed of {report['cores_present']} present",
         f"governor     {report['governor'] or 'not readable'}",
         f"system       {report['system']}",
+        f"memory       {report['memory_available_mib']:.0f} MiB available",
         f"load         {' '.join(f'{value:.2f}' for value in report['load_average'])}",
         f"versions     {versions}",
     ]

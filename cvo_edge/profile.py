@@ -93,6 +93,7 @@ def environment(threads: int | None = None) -> dict[str, Any]:
         "threads": threads,
         "governor": governor,
         "load_average": list(os.getloadavg()),
+        "memory_available_mib": os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") >> 20,
         "versions": versions,
     }
 

@@ -30,6 +30,7 @@ class RunSummary:
     dof: tuple[str, ...]
     confidence: float
     scope: str
+    with_truth: bool = False
     statuses: Counter[str] = field(default_factory=Counter)
     reasons: Counter[str] = field(default_factory=Counter)
     latency: LatencyProfile = field(default_factory=LatencyProfile)
@@ -81,6 +82,8 @@ class RunSummary:
         if self.bounded:
             cells = "".join(f"{f'{v:.1f} {u}':>9}" for v, u in zip(shown, units, strict=True))
             lines.append("mean width".ljust(len(lines[-1]) - 54) + cells)
+        if self.with_truth and not self.compared:
+            lines.append("coverage    no frame matched the ground truth, by name or by stamp")
         if self.compared:
             share = self.covered / self.compared
             lines.append(

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from cvo_edge.artifact import Dtype, ModelSpec, TensorSpec
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 
+MAX_THREADS = 64
+
 _DTYPES: dict[str, Dtype] = {"tensor(uint8)": "uint8", "tensor(float)": "float32"}
 
 
@@ -53,12 +55,9 @@ class Session:
     def __init__(
         self, model_bytes: bytes, threads: int | None = None, expected: ModelSpec | None = None
     ) -> None:
-        present = os.cpu_count() or 1
-        # A thousand threads would not be refused by the engine, and take minutes a frame.
-        if threads is not None and not 1 <= threads <= present:
-            raise UsageError(
-                f"threads: expected 1 to {present}, the cores of this machine, found {threads}"
-            )
+        # The engine would take a thousand, and minutes for a frame.
+        if threads is not None and not 1 <= threads <= MAX_THREADS:
+            raise UsageError(f"threads: expected 1 to {MAX_THREADS}, found {threads}")
         self.threads = threads or allowed_cores()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads

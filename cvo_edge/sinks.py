@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+import stat
 import sys
 from collections.abc import Callable, Iterable
 from types import TracebackType
@@ -27,7 +28,7 @@ class Sink:
     Parameters
     ----------
     path
-        Output file, replaced if it exists, or ``-`` for standard output.
+        Output file, emptied when the first line is written, or ``-`` for standard output.
     format
         ``jsonl``, ``csv``, ``tum`` or, for reading by eye, ``table``.
 
@@ -44,7 +45,7 @@ class Sink:
         self._started = False
         try:
             self._descriptor = (
-                os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+                os.open(path, os.O_WRONLY | os.O_CREAT, 0o666)
                 if self._owned
                 else sys.stdout.fileno()
             )
@@ -71,11 +72,15 @@ class Sink:
         Raises SinkError where the disk refuses, BrokenPipeError where the reader has left, and
         UsageError for a TUM line without a stamp.
         """
+        line = self._line(estimate)
         if not self._started:
             self._started = True
+            # Not before there is something to put in its place.
+            if self._owned and stat.S_ISREG(os.fstat(self._descriptor).st_mode):
+                os.ftruncate(self._descriptor, 0)
             if self._header:
                 self._put(self._header(estimate))
-        self._put(self._line(estimate))
+        self._put(line)
 
     def _put(self, line: bytes) -> None:
         try:

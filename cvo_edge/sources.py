@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 import time
 from collections.abc import Iterator
@@ -85,8 +86,12 @@ def open_source(text: str, fps: float | None = None) -> Source:
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
     """Sort key that reads digits as numbers: ``frame-2`` before ``frame-10``."""
-    parts = re.split(r"(\d+)", str(path))
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts if part]
+    parts = re.split("([0-9]+)", str(path))
+    return [
+        (1, 0, part) if index % 2 == 0 else (0, int(part), "")
+        for index, part in enumerate(parts)
+        if part
+    ]
 
 
 def decode_image(content: bytes) -> NDArray[np.uint8] | None:
@@ -125,7 +130,10 @@ class ImageFiles:
                 image = decode_image(path.read_bytes())
             except OSError:
                 image = None
-            yield Frame(image, _stamp(seq, self._fps), path.name, 1e3 * (perf_counter() - start))
+            spent = 1e3 * (perf_counter() - start)
+            # A file name may be any bytes; a record is UTF-8.
+            name = os.fsencode(path.name).decode("utf-8", "replace")
+            yield Frame(image, _stamp(seq, self._fps), name, spent)
 
 
 class Video:

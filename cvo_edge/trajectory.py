@@ -19,6 +19,8 @@ MATRIX_SUFFIX = ".pose.txt"
 # Frames are matched to the nearest ground-truth stamp within this bound, as the TUM tools do.
 _MAX_STAMP_DIFFERENCE_NS = 20_000_000
 
+_MAX_BYTES = 256 << 20
+
 
 def read_pose_matrix(path: Path) -> Array | None:
     """Read a 4x4 camera-to-world matrix in metres -> pose (7,), or None where it is no pose.
@@ -51,7 +53,7 @@ class GroundTruth:
     def pose_of(self, estimate: PoseInterval) -> Array | None:
         """Return the true ``T_world_camera`` (7,) of an estimate's frame, or None."""
         if self._by_name:
-            return self._by_name.get(estimate.source.split(".")[0])
+            return self._by_name.get(Path(estimate.source).stem.removesuffix(".color"))
         if estimate.stamp_ns is None or not self._stamps_ns:
             return None
         right = bisect_left(self._stamps_ns, estimate.stamp_ns)
@@ -77,6 +79,11 @@ def open_ground_truth(path: Path) -> GroundTruth:
         if not by_name:
             raise SourceError(f"{path}: expected files *{MATRIX_SUFFIX}, found no valid one")
         return GroundTruth(by_name, [], [])
+    if not path.is_file() or path.stat().st_size > _MAX_BYTES:
+        raise SourceError(
+            f"{path}: expected a TUM trajectory of at most {_MAX_BYTES >> 20} MiB or a folder of "
+            f"*{MATRIX_SUFFIX}, found neither"
+        )
     return GroundTruth({}, *_read_tum(path))
 
 

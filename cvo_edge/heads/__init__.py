@@ -24,6 +24,8 @@ class Head(Protocol):
     """What every method provides to the odometer and to calibration."""
 
     parameters_type: ClassVar[type[Struct]]
+    # Name and shape of every model output the method reads, all float32.
+    outputs: ClassVar[Mapping[str, tuple[int, ...]]]
 
     def __init__(self, calibration: Calibration) -> None:
         """Read the method's parameters; raises CalibrationFileError where they are not its own."""

@@ -38,7 +38,7 @@ class CjpParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
     half_width_floor: SixPositive
     latent: Literal["mean", "codebook", "sample"]
-    latent_size: Annotated[int, Meta(ge=1)]
+    latent_size: Annotated[int, Meta(ge=1, le=4096)]
     noise_seed: Annotated[int, Meta(ge=0)]
 
 
@@ -46,6 +46,11 @@ class CjpHead:
     """Score and set of conformalized joint prediction."""
 
     parameters_type: ClassVar[type[Struct]] = CjpParameters
+    outputs: ClassVar[Mapping[str, tuple[int, ...]]] = {
+        "pose": (1, 7),
+        "lower": (1, 6),
+        "upper": (1, 6),
+    }
 
     def __init__(self, calibration: Calibration) -> None:
         try:
@@ -60,6 +65,12 @@ class CjpHead:
                 f"calibration.score: expected additive or normalised for cjp, found {score!r}"
             )
         self._normalised = score == "normalised"
+        smallest = min(q for t in calibration.thresholds for q in (*t.q_hat, 0.0) if q is not None)
+        if self._normalised and smallest < 0.0:
+            raise CalibrationFileError(
+                f"thresholds.q_hat: expected factors of at least 0 for the normalised score, "
+                f"found {smallest}"
+            )
         self._floor = np.array(self.parameters.half_width_floor)
 
     def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:

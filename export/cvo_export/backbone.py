@@ -67,6 +67,8 @@ class Backbone(nn.Module):
             self.body: Any = timm.create_model(config.name, pretrained=False, num_classes=0)
         except RuntimeError as error:
             raise UsageError(f"backbone: {error}") from None
+        if not hasattr(self.body, "prune_intermediate_layers"):
+            raise UsageError(f"backbone: expected a network with stages, found {config.name}")
         mean, std = _mean_std(self.body, config.normalisation)
         self.mean, self.std = mean, std
         self.register_buffer("_mean", torch.tensor(mean).view(1, 3, 1, 1) * 255.0)
@@ -74,9 +76,14 @@ class Backbone(nn.Module):
         self._mean: Tensor
         self._std: Tensor
         self._indices = self._cut()
-        with torch.no_grad():
-            blank = torch.zeros((1, height, width, 3), dtype=torch.uint8)
-            maps = self.eval().maps(blank)
+        blank = torch.zeros((1, height, width, 3), dtype=torch.uint8)
+        try:
+            with torch.no_grad():
+                maps = self.eval().maps(blank)
+        except (AssertionError, RuntimeError) as error:
+            raise UsageError(
+                f"backbone: expected {config.name} to take {width}x{height} images, found {error}"
+            ) from None
         self.map_shapes = [tuple(int(size) for size in m.shape[1:]) for m in maps]
         for number, (_, map_height, map_width) in enumerate(self.map_shapes):
             rows, columns = config.grid

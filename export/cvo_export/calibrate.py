@@ -12,21 +12,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import SixOrUnbounded, Threshold
+from cvo_edge.artifact import CONFIDENCES, SixOrUnbounded, Threshold
 from cvo_edge.conformal import (
     conformal_quantile,
     effective_sample_size,
     hierarchical_quantile,
     joint_scores,
 )
-from cvo_edge.errors import UsageError
+from cvo_edge.errors import SourceError
 from cvo_edge.odometer import Observation, Odometer
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
 Rule = Literal["pooled", "hierarchical"]
-
-CONFIDENCES = (0.5, 0.8, 0.9, 0.95, 0.99)
 
 # The joint scope compares degrees of freedom by this quantile of their scores on val.
 _SCALE_LEVEL = 0.9
@@ -55,17 +53,21 @@ class Observed:
 def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]) -> Observed:
     """Run frames of a data set through the odometer's network, in order.
 
-    Raises UsageError where no frame passes the checks.
+    Raises SourceError where no frame passes the checks.
     """
     kept: list[int] = []
     seen: list[Observation] = []
     for index in indices.tolist():
-        observation = odometer.observe(dataset.read_image(index), seq=index)
+        try:
+            image = dataset.read_image(index)
+        except SourceError:
+            image = None  # the odometer flags it as it would on the device
+        observation = odometer.observe(image, seq=index)
         if observation.fault is None:
             kept.append(index)
             seen.append(observation)
     if not seen:
-        raise UsageError(
+        raise SourceError(
             f"{dataset.name}: expected frames that pass the checks, found none of {len(indices)}"
         )
     pose = np.array([observation.pose for observation in seen])

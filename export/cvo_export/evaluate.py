@@ -13,10 +13,10 @@ from scipy.stats import betabinom
 
 from cvo_edge import geometry
 from cvo_edge.artifact import Calibration, Threshold, read_bundle
-from cvo_edge.conformal import conformal_rank, effective_sample_size, interval_score
+from cvo_edge.conformal import conformal_rank, interval_score
 from cvo_edge.errors import GateError
 from cvo_edge.odometer import Odometer
-from cvo_export.calibrate import Observed, Rule, observe, thresholds
+from cvo_export.calibrate import Observed, Rule, effective_frames, observe, thresholds
 from cvo_export.datasets import PoseDataset
 from cvo_export.splits import Split, same_split
 
@@ -52,7 +52,8 @@ def evaluate(
         bundle, threads=threads, confidence=first.confidence, scope=first.scope
     ) as odometer:
         seen = observe(odometer, dataset, indices)
-        sets = _Sets(odometer, seen, split is not None and split.kind == "random")
+        exact = split is not None and split.kind == "random"
+        sets = _Sets(odometer, seen, exact, calibration.calibration.rule)
         levels = [sets.level(entry) for entry in calibration.thresholds]
         report = {
             "bundle": calibration.name,
@@ -78,9 +79,10 @@ def evaluate(
                 "pooled" if calibration.calibration.rule == "hierarchical" else "hierarchical"
             )
             entries = _recalibrated(odometer, dataset, split, rule)
+            others = _Sets(odometer, seen, exact, rule)
             report["other_rule"] = {
                 "rule": rule,
-                "levels": [sets.level(entry) for entry in entries],
+                "levels": [others.level(entry) for entry in entries],
             }
     return report
 
@@ -124,7 +126,7 @@ def check_coverage(report: Mapping[str, Any], least: float) -> None:
 
 
 def find_level(levels: list[dict[str, Any]], confidence: float, scope: str) -> dict[str, Any]:
-    """Return the entry of a report's levels for this confidence and scope."""
+    """Return the entry for this confidence, one of those every bundle stores, and scope."""
     return next(
         level for level in levels if level["confidence"] == confidence and level["scope"] == scope
     )
@@ -169,7 +171,7 @@ def _level_lines(rule: str, levels: list[dict[str, Any]]) -> list[str]:
     for level in levels:
         coverage = "".join(f"{value:>7.3f}" for value in level["coverage"])
         band = level["coverage_band"]
-        shown = "unbounded" if band is None else f"{band[0]:.3f}-{band[1]:.3f}"
+        shown = "-" if band is None else f"{band[0]:.3f}-{band[1]:.3f}"
         shown += " " if level["coverage_band_exact"] or band is None else "?"
         width = np.array(level["median_width"])
         lines.append(
@@ -200,6 +202,7 @@ class _Sets:
     odometer: Odometer
     seen: Observed
     exact: bool
+    rule: str
 
     @property
     def calibration(self) -> Calibration:
@@ -226,18 +229,25 @@ class _Sets:
         n, n_test = self.calibration.calibration.n, len(covered)
         score = interval_score(width, distance, 1.0 - entry.confidence)
         deviation = np.array(self.calibration.pose.standard_deviation)
-        effective_test = effective_sample_size(score.mean(axis=1))
+        nonconformity = self.odometer.head.scores(
+            self.seen.outputs, self.seen.point, self.seen.truth
+        )
+        effective_test = effective_frames(nonconformity, self.seen.sequence)
+        # The band counts frames: it says nothing of a rule that counts sequences.
+        finite = self.rule == "pooled" and all(q is not None for q in entry.q_hat)
         return {
             "confidence": entry.confidence,
             "scope": entry.scope,
             "coverage": covered.mean(axis=0).tolist(),
             "coverage_bounded": covered[bounded].mean(axis=0).tolist() if bounded.any() else None,
-            "coverage_band": coverage_band(n, n_test, entry.confidence),
+            "coverage_band": coverage_band(n, n_test, entry.confidence) if finite else None,
             "coverage_band_effective": coverage_band(
                 max(1, int(self.calibration.calibration.n_effective)),
                 max(1, int(effective_test)),
                 entry.confidence,
-            ),
+            )
+            if finite
+            else None,
             "coverage_band_exact": self.exact,
             "joint_coverage": float(covered.all(axis=1).mean()),
             "mean_width": width.mean(axis=0).tolist(),

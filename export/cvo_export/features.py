@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvo_edge import preprocess
-from cvo_edge.errors import UsageError
+from cvo_edge.errors import SourceError
 from cvo_edge.session import Session, allowed_cores
 from cvo_export.augment import AugmentConfig, augmented, model_intrinsics
 from cvo_export.backbone import Backbone
@@ -44,7 +44,7 @@ class ModelImages:
         for row, index in enumerate(indices.tolist()):
             image = preprocess.to_bgr8(dataset.read_image(index))
             if image is None:
-                raise UsageError(f"{dataset.frame_names[index]}: expected a colour image")
+                raise SourceError(f"{dataset.frame_names[index]}: expected a colour image")
             self.images[row] = preprocess.model_input(image, height, width, crop)[0]
             if self.K is None and dataset.intrinsics is not None:
                 self.K = model_intrinsics(dataset.intrinsics, image.shape, height, width, crop)

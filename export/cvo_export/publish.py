@@ -15,14 +15,14 @@ import torch
 from numpy.typing import NDArray
 
 from cvo_edge import artifact, preprocess
-from cvo_edge.artifact import Bundle, Calibration, Threshold
+from cvo_edge.artifact import CONFIDENCES, Bundle, Calibration, Threshold
 from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_edge.errors import SinkError
 from cvo_edge.heads.cjp import CjpHead, CjpParameters
 from cvo_edge.odometer import Odometer
 from cvo_edge.selftest import check_selftest, observe_selftest
 from cvo_edge.session import Session
-from cvo_export.calibrate import CONFIDENCES, Observed, Rule, effective_frames, observe, thresholds
+from cvo_export.calibrate import Observed, Rule, effective_frames, observe, thresholds
 from cvo_export.run import Run
 from cvo_export.to_onnx import OPSET, check_parity, export_onnx
 
@@ -30,7 +30,8 @@ Array = NDArray[np.float64]
 
 WORLD_FRAME, CAMERA_FRAME = "world", "camera"
 SELFTEST_TOLERANCE = 1e-3
-_SELFTEST_SIZE = (480, 640)
+# Of another shape than any camera and model, so that resize and crop are tested, too.
+_SELFTEST_SIZE = (418, 650)
 
 # How far beyond the training poses a pose is still plausible, in ranges of each DoF.
 _LIMIT_MARGIN = 0.5
@@ -245,7 +246,10 @@ def _versions() -> dict[str, str]:
 
 
 def _check_target(bundle_dir: Path) -> None:
-    if bundle_dir.exists() and not (bundle_dir / artifact.CALIBRATION_FILE).is_file():
+    own = {artifact.CALIBRATION_FILE, artifact.MODEL_FILE}
+    if bundle_dir.exists() and not (
+        bundle_dir.is_dir() and {path.name for path in bundle_dir.iterdir()} == own
+    ):
         raise SinkError(
             f"{bundle_dir}: expected a new folder or a bundle to replace, found another"
         )

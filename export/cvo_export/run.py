@@ -9,7 +9,7 @@ from typing import Literal
 import msgspec
 import torch
 
-from cvo_edge.errors import UsageError
+from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.preprocess import Crop
 from cvo_export.augment import AugmentConfig
 from cvo_export.backbone import Backbone, BackboneConfig
@@ -122,23 +122,38 @@ class Run:
 
 
 def open_run(run_dir: Path, config: TrainConfig) -> tuple[PoseDataset, Split]:
-    """Claim a run folder for a configuration and make its split.
+    """Open the data set of a configuration and make its split; nothing is written yet.
 
     Raises UsageError where the folder belongs to another configuration.
     """
-    run_dir.mkdir(parents=True, exist_ok=True)
     path = run_dir / CONFIG_FILE
-    content = msgspec.json.format(msgspec.json.encode(config), indent=1)
-    if not path.exists():
-        path.write_bytes(content)
-    elif path.read_bytes() != content:
+    if run_dir.exists() and not run_dir.is_dir():
+        raise SinkError(f"{run_dir}: expected a folder, found a file")
+    if path.is_file() and path.read_bytes() != _encoded(config):
         raise UsageError(
             f"{run_dir}: expected a new folder or a run of the same options, found another run"
         )
     dataset = open_dataset(config.dataset)
-    split = make_split(dataset, config.split, config.seed)
-    split.write(run_dir / SPLIT_FILE, dataset)
-    return dataset, split
+    return dataset, make_split(dataset, config.split, config.seed)
+
+
+def claim_run(run_dir: Path, config: TrainConfig, dataset: PoseDataset, split: Split) -> None:
+    """Write configuration and split, once everything that may be refused has been tried.
+
+    Raises SinkError where the folder cannot be written.
+    """
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        split.write(run_dir / SPLIT_FILE, dataset)
+        partial = run_dir / (CONFIG_FILE + ".partial")
+        partial.write_bytes(_encoded(config))
+        partial.replace(run_dir / CONFIG_FILE)
+    except OSError as error:
+        raise SinkError(f"{run_dir}: cannot be written: {error.strerror}") from None
+
+
+def _encoded(config: TrainConfig) -> bytes:
+    return msgspec.json.format(msgspec.json.encode(config), indent=1)
 
 
 def load_run(run_dir: Path, dataset: str | None = None) -> Run:
@@ -150,11 +165,16 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
     path = run_dir / NETWORK_FILE
     if not path.is_file():
         raise UsageError(f"{run_dir}: expected a finished run, found no {NETWORK_FILE}")
-    config = msgspec.json.decode((run_dir / CONFIG_FILE).read_bytes(), type=TrainConfig)
-    recorded = msgspec.json.decode((run_dir / SPLIT_FILE).read_bytes())
+    try:
+        config = msgspec.json.decode((run_dir / CONFIG_FILE).read_bytes(), type=TrainConfig)
+        recorded = msgspec.json.decode((run_dir / SPLIT_FILE).read_bytes())
+        stored = torch.load(path, weights_only=True)
+    # torch.load raises what its unpickler and its zip reader happen to raise.
+    except Exception as error:  # noqa: BLE001
+        line = " ".join(str(error).split())[:120]
+        raise UsageError(f"{run_dir}: expected the files of a finished run, found {line}") from None
     opened = open_dataset(dataset or config.dataset)
     split = same_split(opened, config.split, config.seed, recorded["sha256"])
-    stored = torch.load(path, weights_only=True)
     target = Target(*(values.numpy() for values in stored["target"]))
     backbone = Backbone(config.backbone, config.height, config.width)
     graph = PoseGraph(backbone, CjpNetwork(backbone.size, config.head), target).eval()

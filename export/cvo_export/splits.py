@@ -12,7 +12,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from cvo_edge.errors import SourceError, UsageError
 from cvo_export.datasets import PoseDataset
 
 Kind = Literal["random", "block", "sequence"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 ROLES = ("train", "fit", "val", "cal", "test")
 SHARES = {"train": 0.4, "fit": 0.1, "val": 0.1, "cal": 0.2, "test": 0.2}
 
@@ -164,7 +163,7 @@ def _border(
 def _sequence(dataset: PoseDataset, generator: np.random.Generator) -> dict[str, Indices]:
     everything = range(len(dataset.sequence_names))
     test = np.array(sorted(dataset.own_test), dtype=np.int64)
-    pool = sorted(dataset.own_train or set(everything) - dataset.own_test)
+    pool = sorted((dataset.own_train or frozenset(everything)) - dataset.own_test)
     shuffled = generator.permutation(np.array(pool, dtype=np.int64))
     shares = dict(SHARES)
     if test.size:

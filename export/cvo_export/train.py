@@ -1,7 +1,7 @@
 """One training loop: features, steps, early stopping on val, checkpoints.
 
-Every random draw is a function of (seed, phase, step), so that an interrupted run that goes on ends
-with the same numbers as one that was never interrupted.
+Batches are a function of (seed, phase, step) and noise comes from a generator whose state is in
+the checkpoint: an interrupted run that goes on ends with the same numbers as one that never was.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_export.backbone import Backbone, load_weights
 from cvo_export.features import FeatureExtractor, ModelImages, Progress, cached_copies
 from cvo_export.heads.cjp import CjpDecoded, CjpLoss, CjpNetwork
-from cvo_export.run import Run, TrainConfig, open_run
+from cvo_export.run import Run, TrainConfig, claim_run, open_run
 from cvo_export.target import PoseGraph, Target, fit_target
 
 Array = NDArray[np.float64]
@@ -51,6 +51,7 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress) -> Run:
     weights_sha256 = load_weights(backbone, config.weights)
     indices = np.concatenate([split.roles["train"], split.roles["fit"]])
     target = fit_target(dataset.poses[indices])
+    claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
     trainer = _Trainer(
         run_dir,
@@ -263,7 +264,8 @@ def _schedule(step: int, steps: int) -> float:
 def val_score(network: CjpNetwork, features: Tensor, y: Array) -> float:
     """Mean interval score at 90 % on val (n, 6), standardised, bounds conformalised on val itself.
 
-    What the finished bundle will be judged by, as far as val can say it.
+    Close to what the finished bundle will be judged by: there the score (additive here) is chosen
+    afterwards, and thresholds come from other frames than the ones judged.
     """
     network.eval()
     with torch.no_grad():

@@ -23,7 +23,7 @@ from cvo_edge.artifact import decode_calibration, encode_calibration, read_bundl
 def redigested(document):
     """Bytes of a document with its digest made to fit, as an attacker or a bug would write it."""
     document = {**document, "digest": "0" * 64}
-    content = json.dumps(document).encode()
+    content = json.dumps(document).encode("utf-8")
     return content.replace(b"0" * 64, hashlib.sha256(content).hexdigest().encode())
 
 
@@ -82,6 +82,11 @@ REFUSED = [
     (("preprocess", "height"), 0, "preprocess.height"),
     (("preprocess", "width"), 320, "model.inputs"),
     (("preprocess", "std"), [0.5, 0.5, 0], "preprocess.std"),
+    (("preprocess", "in_graph"), [], "preprocess.in_graph"),
+    (("preprocess", "in_graph"), ["cast", "cast", "cast"], "preprocess.in_graph"),
+    (("name",), "two\nlines", "name"),
+    (("name",), "\ud800", "name"),
+    (("name",), "\x1b[31m", "name"),
     (("preprocess", "std"), [0.5, 0.5, -0.5], "preprocess.std"),
     (("pose", "standard_deviation"), [1, 1, 1, 1, 1, True], "standard_deviation"),
     (("pose", "standard_deviation"), [1, 1, 1, 1, 1], "standard_deviation"),
@@ -91,7 +96,7 @@ REFUSED = [
     (("pose", "limits", "lowest"), [9e9] * 6, "lowest < highest"),
     (("thresholds",), [], "thresholds"),
     (("thresholds", 0, "confidence"), 1.0, "confidence"),
-    (("thresholds", 0, "confidence"), 0.8, "each confidence once"),
+    (("thresholds", 4), ..., "found none for 0.9"),
     (("thresholds", 0, "q_hat"), [1, 2, 3], "q_hat"),
     (("thresholds", 0, "q_hat", 0), "1", "q_hat"),
     (("thresholds", 0, "q_hat", 0), 1e9, "growth with the confidence"),
@@ -99,7 +104,9 @@ REFUSED = [
     (("calibration", "n"), 0, "calibration.n"),
     (("calibration", "n"), -5, "calibration.n"),
     (("calibration", "rule"), "best", "calibration.rule"),
+    (("calibration", "n"), 10**19, "calibration.n"),
     (("selftest", "tolerance"), -1.0, "selftest.tolerance"),
+    (("selftest", "tolerance"), 1e300, "selftest.tolerance"),
     (("selftest", "outputs", "pose"), [1.0], "selftest.outputs"),
     (("provenance", "seed"), -1, "provenance.seed"),
 ]
@@ -118,6 +125,7 @@ METHOD_PARAMETERS = [
     ("half_width_floor", [1, 1, 1, 1, 1, 0]),
     ("latent", "median"),
     ("latent_size", 0),
+    ("latent_size", 10**12),
     ("surplus", 1),
 ]
 
@@ -127,6 +135,34 @@ def test_wrong_method_parameters_are_refused_at_load(copied_bundle, document, ke
     wrong = redigested(replaced(document, ("method_parameters", key), value))
     (copied_bundle / "calibration.json").write_bytes(wrong)
     with pytest.raises(CalibrationFileError, match="method_parameters"):
+        Odometer.load(copied_bundle)
+
+
+@pytest.mark.parametrize("change", ["latent", "dropped output"])
+def test_tensors_that_the_method_does_not_work_with_are_refused_at_load(
+    copied_bundle, document, change
+):
+    if change == "latent":
+        wrong = replaced(document, ("method_parameters", "latent"), "sample")
+    else:
+        wrong = replaced(document, ("model", "outputs"), document["model"]["outputs"][:2])
+        wrong = replaced(wrong, ("selftest", "outputs", "upper"), ...)
+    (copied_bundle / "calibration.json").write_bytes(redigested(wrong))
+    with pytest.raises(BundleMismatchError, match=r"model\.(inputs|outputs): expected"):
+        Odometer.load(copied_bundle)
+
+
+def test_a_confidence_stored_twice_is_refused(document):
+    twice = [*document["thresholds"], document["thresholds"][0]]
+    with pytest.raises(CalibrationFileError, match="each confidence once"):
+        decode_calibration(redigested(replaced(document, ("thresholds",), twice)))
+
+
+def test_a_negative_factor_is_refused(copied_bundle, document):
+    wrong = replaced(document, ("thresholds", 0, "q_hat", 0), -0.5)
+    wrong = replaced(wrong, ("calibration", "score"), "normalised")
+    (copied_bundle / "calibration.json").write_bytes(redigested(wrong))
+    with pytest.raises(CalibrationFileError, match="factors of at least 0"):
         Odometer.load(copied_bundle)
 
 

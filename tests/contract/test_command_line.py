@@ -114,6 +114,54 @@ def test_killed_without_warning_loses_no_acknowledged_record(bundle_dir, clip_di
     assert [json.loads(line)["seq"] for line in complete] == list(range(1, len(complete) + 1))
 
 
+def test_closed_or_full_standard_output_is_exit_7(bundle_dir):
+    if Path("/dev/full").exists():
+        with Path("/dev/full").open("w") as full:
+            result = subprocess.run(
+                [*CVO_EDGE, "inspect", str(bundle_dir)],
+                stdout=full,
+                stderr=subprocess.PIPE,
+                text=True,
+                check=False,
+            )
+        assert result.returncode == 7
+        assert len(result.stderr.strip().splitlines()) == 1
+    shell = " ".join(f"'{word}'" for word in [*CVO_EDGE, "inspect", str(bundle_dir)])
+    closed = subprocess.run(
+        ["sh", "-c", shell + " >&-"], capture_output=True, text=True, check=False
+    )
+    assert closed.returncode == 7
+    assert len(closed.stderr.strip().splitlines()) == 1
+
+
+def test_an_output_that_is_an_input_is_refused(bundle_dir, clip_dir):
+    image = next(iter(sorted(clip_dir.glob("*.color.jpg"))))
+    before = image.read_bytes()
+    refused(cvo_edge("run", bundle_dir, clip_dir, "-o", image), 2)
+    refused(cvo_edge("run", bundle_dir, image, "-o", image), 2)
+    refused(cvo_edge("run", bundle_dir, clip_dir, "-o", bundle_dir / "model.onnx"), 2)
+    assert image.read_bytes() == before
+
+
+def test_what_a_path_holds_cannot_forge_a_line(bundle_dir):
+    refused(cvo_edge("run", bundle_dir, "a\nb\x1b[31m"), 6)
+    refused(cvo_edge("run", bundle_dir, "x" * 5000), 6)
+
+
+def test_ground_truth_that_matches_nothing_is_said(bundle_dir, clip_dir, tmp_path):
+    truth = tmp_path / "truth.txt"
+    truth.write_text("1 0 0 0 0 0 0 1\n")
+    result = cvo_edge("run", bundle_dir, clip_dir, "--max-frames", 1, "--ground-truth", truth)
+    assert "no frame matched the ground truth" in result.stderr
+
+
+def test_bench_of_a_source_without_frames_ends(bundle_dir, tmp_path):
+    path = tmp_path / "empty.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (64, 48))
+    writer.release()
+    refused(cvo_edge("bench", bundle_dir, path, timeout=60), 6)
+
+
 def test_exit_2_for_what_cannot_be_asked(bundle_dir, clip_dir):
     assert "0.5, 0.8, 0.9, 0.95, 0.99" in refused(
         cvo_edge("run", bundle_dir, clip_dir, "--confidence", 0.42), 2

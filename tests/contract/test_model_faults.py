@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cvo_edge import Bundle, Odometer, Reason, Status, artifact
-from cvo_edge.artifact import Threshold, decode_calibration, encode_calibration
+from cvo_edge.artifact import CONFIDENCES, Threshold, decode_calibration, encode_calibration
 
 onnx = pytest.importorskip("onnx")
 
@@ -51,7 +51,11 @@ def odometer(bundle, pose=IDENTITY, lower=(-1.0,) * 6, upper=(1.0,) * 6, q_hat=(
             calibration.pose, limits=limits, reference_q_xyzw=(0.0, 0.0, 0.0, 1.0)
         ),
         calibration=msgspec.structs.replace(calibration.calibration, score="additive"),
-        thresholds=(Threshold(confidence=0.9, scope="marginal", q_hat=q_hat, q_hat_upper=None),),
+        thresholds=tuple(
+            Threshold(confidence=confidence, scope=scope, q_hat=q_hat, q_hat_upper=None)
+            for confidence in CONFIDENCES
+            for scope in ("marginal", "joint")
+        ),
     )
     return Odometer(Bundle(decode_calibration(encode_calibration(changed)), model_bytes))
 

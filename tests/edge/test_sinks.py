@@ -83,6 +83,16 @@ def test_table_says_unbounded_in_words(tmp_path, estimates):
     assert write(tmp_path / "a.txt", "table", wide).count("unbounded") == 6
 
 
+def test_an_old_file_is_kept_until_there_is_a_line_to_put_in_its_place(tmp_path, estimates):
+    path = tmp_path / "a.txt"
+    path.write_text("precious\n" * 9)
+    unstamped = dataclasses.replace(estimates[0], stamp_ns=None)
+    with Sink(str(path), "tum") as sink, pytest.raises(UsageError):
+        sink.write(unstamped)
+    assert path.read_text() == "precious\n" * 9
+    assert len(write(path, "jsonl", estimates).splitlines()) == len(estimates)
+
+
 def test_a_file_that_cannot_be_opened_is_a_sink_error(tmp_path):
     with pytest.raises(SinkError, match="cannot be written"):
         Sink(str(tmp_path / "none" / "a.jsonl"), "jsonl")

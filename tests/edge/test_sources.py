@@ -1,5 +1,6 @@
 """Sources: order, damage, ends, stamps."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -29,6 +30,15 @@ def test_folder_is_in_natural_order(tmp_path):
         write(tmp_path / name)
     (tmp_path / "notes.txt").write_text("no image")
     assert names(open_source(str(tmp_path))) == ["frame-9.png", "frame-10.png", "frame-100.png"]
+
+
+def test_names_of_any_bytes_and_odd_digits_are_read(tmp_path):
+    for name in (b"a\xff.png", "1\u00b22.png".encode()):
+        plain = write(tmp_path / "plain.png")
+        os.rename(os.fsencode(plain), os.fsencode(tmp_path) + b"/" + name)  # noqa: PTH104
+    found = names(open_source(str(tmp_path)))
+    assert len(found) == 2
+    assert all(name.encode("utf-8") for name in found)
 
 
 def test_colour_images_alone_where_there_are_any_and_never_depth(tmp_path):

@@ -1,5 +1,7 @@
 """Ground truth: matrices and TUM files, and what is refused."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -99,5 +101,7 @@ def test_a_broken_trajectory_names_the_rule(tmp_path, text, rule):
 def test_no_ground_truth_is_refused(tmp_path):
     with pytest.raises(SourceError, match="found no valid one"):
         open_ground_truth(tmp_path)
-    with pytest.raises(SourceError, match="expected a TUM trajectory"):
-        open_ground_truth(tmp_path / "none.txt")
+    os.mkfifo(tmp_path / "fifo")
+    for name in ("none.txt", "fifo"):
+        with pytest.raises(SourceError, match="expected a TUM trajectory"):
+            open_ground_truth(tmp_path / name)

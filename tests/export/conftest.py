@@ -29,6 +29,7 @@ def tiny_config(**changes: Any) -> TrainConfig:
         "copies": 2,
         "steps": 240,
         "warm_up_steps": 20,
+        "averaging": 0.9,
     }
     return TrainConfig(**{**values, **changes})
 

@@ -100,7 +100,7 @@ def test_table_shows_every_level(report):
     text = "\n".join(table(report))
     assert text.count("marginal") == 5
     assert text.count("joint ") >= 5
-    assert "unbounded" in text
+    assert text.count("-   ") >= 2  # no band where the set is everything
 
 
 def cvo_export(*arguments):

@@ -1,5 +1,6 @@
 """From run to bundle: parity, thresholds through the runtime, all or nothing."""
 
+import copy
 import dataclasses
 import json
 
@@ -7,13 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from cvo_edge import Odometer, SinkError, UsageError
-from cvo_edge.artifact import read_bundle, read_calibration
+from cvo_edge import Odometer, SinkError, SourceError
+from cvo_edge.artifact import CONFIDENCES, read_bundle, read_calibration
 from cvo_edge.conformal import conformal_quantile
 from cvo_edge.errors import GateError
 from cvo_edge.selftest import check_selftest
 from cvo_edge.session import Session
-from cvo_export.calibrate import CONFIDENCES, observe
+from cvo_export.calibrate import observe
 from cvo_export.heads.cjp import CjpConfig
 from cvo_export.publish import publish
 from cvo_export.to_onnx import check_parity
@@ -65,12 +66,10 @@ def test_torch_and_the_graph_agree_and_another_graph_does_not(tiny_bundle, tiny_
     session = Session(read_bundle(tiny_bundle).model_bytes)
     image = np.random.default_rng(0).integers(0, 255, (1, 48, 64, 3)).astype(np.uint8)
     assert check_parity(tiny_run.graph, session, [{"image": image}], ["image"]) < 1e-4
-    tiny_run.graph.mean += 1.0
-    try:
-        with pytest.raises(GateError, match="agree"):
-            check_parity(tiny_run.graph, session, [{"image": image}], ["image"])
-    finally:
-        tiny_run.graph.mean -= 1.0
+    other = copy.deepcopy(tiny_run.graph)
+    other.mean += 1.0
+    with pytest.raises(GateError, match="agree"):
+        check_parity(other, session, [{"image": image}], ["image"])
 
 
 def test_a_bundle_is_replaced_whole_and_anything_else_is_refused(tiny_run, tiny_bundle, tmp_path):
@@ -108,7 +107,23 @@ def test_codebook_latent_needs_the_image_alone(tmp_path):
         assert [spec.name for spec in odometer.session.inputs] == ["image"]
 
 
+def test_a_damaged_image_costs_that_frame_only(tiny_bundle, tiny_run):
+    def read_image(index):
+        if index == 1:
+            raise SourceError("damaged")
+        return tiny_run.dataset.read_image(index)
+
+    holed = dataclasses.replace(tiny_run.dataset, read_image=read_image)
+    with Odometer.load(tiny_bundle) as odometer:
+        seen = observe(odometer, holed, np.arange(3))
+    assert seen.indices.tolist() == [0, 2]
+    assert seen.flagged == 1
+
+
 def test_no_frame_that_passes_is_a_usage_error(tiny_bundle, tiny_run):
     blind = dataclasses.replace(tiny_run.dataset, read_image=lambda _: np.zeros((1, 1), np.uint8))
-    with Odometer.load(tiny_bundle) as odometer, pytest.raises(UsageError, match="found none of 2"):
+    with (
+        Odometer.load(tiny_bundle) as odometer,
+        pytest.raises(SourceError, match="found none of 2"),
+    ):
         observe(odometer, blind, np.array([0, 1]))

@@ -79,6 +79,13 @@ def test_sequence_keeps_sequences_whole_and_respects_the_own_test_list():
     assert all(split.roles[role].size == 50 * len(by_role[role]) for role in ROLES)
 
 
+def test_a_sequence_in_both_own_lists_is_test_alone():
+    made = dataset([10] * 10, own_train=range(10), own_test=range(3))
+    split = make_split(made, "sequence", 0)
+    joined = np.concatenate([split.roles[role] for role in ROLES])
+    assert len(set(joined.tolist())) == joined.size
+
+
 def test_sequence_without_lists_gives_enough_calibration_sequences():
     made = dataset([10] * 48)
     split = make_split(made, "sequence", 0)

@@ -121,7 +121,7 @@ def _own_list(path: Path, names: tuple[str, ...]) -> frozenset[int]:
     return frozenset(
         index
         for index, name in enumerate(names)
-        if name.startswith("seq-") and int(name.removeprefix("seq-")) in numbers
+        if re.fullmatch("seq-[0-9]+", name) and int(name.removeprefix("seq-")) in numbers
     )
 
 

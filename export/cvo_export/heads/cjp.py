@@ -7,7 +7,7 @@ point m and bounds Q_l, Q_h of all six degrees of freedom, trained with one loss
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import torch
 from scipy.stats import norm, qmc
@@ -24,7 +24,6 @@ from cvo_export.losses import (
 
 Latent = Literal["mean", "codebook", "sample"]
 Bounds = Literal["softplus", "free"]
-LATENTS: tuple[Latent, ...] = get_args(Latent)
 
 DOF = 6
 _CODEBOOK_SIZE = 16
