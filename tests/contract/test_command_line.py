@@ -15,6 +15,13 @@ import pytest
 from cvo_edge import Odometer, open_source
 
 CVO_EDGE = [sys.executable, "-c", "from cvo_edge.cli import main; main()"]
+# Whoever runs the suite in the background of a script has it ignore SIGINT, and its children too.
+FOREGROUND = [
+    sys.executable,
+    "-c",
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from cvo_edge.cli import main; main()",
+]
 
 
 def cvo_edge(*arguments, **options):
@@ -85,7 +92,7 @@ def test_a_signal_ends_it_with_every_record_whole(bundle_dir, clip_dir, tmp_path
         ).symlink_to(image)
     out = tmp_path / "out.jsonl"
     with subprocess.Popen(
-        [*CVO_EDGE, "run", str(bundle_dir), str(frames), "-o", str(out), "--quiet"],
+        [*FOREGROUND, "run", str(bundle_dir), str(frames), "-o", str(out), "--quiet"],
         stderr=subprocess.PIPE,
     ) as process:
         deadline = time.monotonic() + 60
