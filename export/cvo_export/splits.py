@@ -107,12 +107,16 @@ def same_split(dataset: PoseDataset, kind: Kind, seed: int, digest: str) -> Spli
 
 
 def _counts(total: int, shares: Mapping[str, float]) -> dict[str, int]:
-    """Whole numbers that add up to ``total``, by largest remainder."""
+    """Whole numbers that add up to ``total``, by largest remainder; none is 0 if that can be."""
     exact = {role: total * share / sum(shares.values()) for role, share in shares.items()}
     counts = {role: int(value) for role, value in exact.items()}
     by_remainder = sorted(exact, key=lambda role: counts[role] - exact[role])
     for role in by_remainder[: total - sum(counts.values())]:
         counts[role] += 1
+    if total >= len(counts):
+        while not all(counts.values()):
+            counts[max(counts, key=lambda role: counts[role])] -= 1
+            counts[min(counts, key=lambda role: counts[role])] += 1
     return counts
 
 

@@ -79,6 +79,11 @@ def test_sequence_keeps_sequences_whole_and_respects_the_own_test_list():
     assert all(split.roles[role].size == 50 * len(by_role[role]) for role in ROLES)
 
 
+def test_five_sequences_are_enough_for_the_five_roles():
+    split = make_split(dataset([60] * 5), "sequence", 0)
+    assert [split.roles[role].size for role in ROLES] == [60] * 5
+
+
 def test_a_sequence_in_both_own_lists_is_test_alone():
     made = dataset([10] * 10, own_train=range(10), own_test=range(3))
     split = make_split(made, "sequence", 0)
