@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.artifact import read_bundle
-from cvo_edge.conformal import conformal_quantile, conformal_rank, joint_scores
+from cvo_edge.conformal import JointScale, conformal_quantile, conformal_rank
 from cvo_edge.odometer import Odometer
-from cvo_export.calibrate import joint_scales, observe
+from cvo_export.calibrate import observe
 from cvo_export.datasets import open_dataset
 from cvo_export.splits import same_split
 
@@ -29,12 +29,13 @@ CONFIDENCE = 0.9
 
 
 def resplit(
-    scores: NDArray[np.float64], n: int, scales: NDArray[np.float64], resplits: int
+    scores: NDArray[np.float64], n: int, scale: JointScale, resplits: int
 ) -> tuple[NDArray[np.float64], float]:
-    """Mean coverage per DoF (6,) and mean joint coverage over many deals of scores (m, 6)."""
+    """Mean coverage per DoF (6,) and mean joint coverage over many deals of scores (m, 1, 6)."""
     generator = np.random.default_rng(0)
     marginal, jointly = [], []
-    joint = joint_scores(scores, scales)
+    joint = scale.comparable(scores).max(axis=(1, 2))
+    scores = scores[:, 0]
     order = np.arange(len(scores))
     for deal in range(resplits):
         order = order[::-1] if deal % 2 else generator.permutation(len(scores))
@@ -56,15 +57,15 @@ def main() -> None:
     bundle = read_bundle(arguments.bundle)
     recorded = bundle.calibration.calibration.split
     dataset = open_dataset(arguments.dataset)
-    roles = same_split(dataset, recorded.kind, recorded.seed, recorded.sha256).roles
+    roles = same_split(dataset, recorded).roles
     with Odometer(bundle) as odometer:
         seen = observe(odometer, dataset, np.concatenate([roles["cal"], roles["test"]]))
         scores = odometer.head.scores(seen.outputs, seen.point, seen.truth)
         val = observe(odometer, dataset, roles["val"])
-        scales = joint_scales(odometer.head.scores(val.outputs, val.point, val.truth))
+        scale = odometer.head.joint_scale(odometer.head.scores(val.outputs, val.point, val.truth))
     n = roles["cal"].size
     expected = conformal_rank(n, CONFIDENCE) / (n + 1)
-    marginal, jointly = resplit(scores, n, scales, arguments.resplits)
+    marginal, jointly = resplit(scores, n, scale, arguments.resplits)
     worst = max(abs(float(value) - expected) for value in (*marginal, jointly))
     print(f"{arguments.resplits} deals of {len(scores)} frames, n = {n}: k/(n+1) = {expected:.4f}")
     print("coverage per DoF " + " ".join(f"{value:.4f}" for value in marginal))

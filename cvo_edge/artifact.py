@@ -15,7 +15,7 @@ import stat
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -45,7 +45,9 @@ SixOrUnbounded = tuple[
     float | None, float | None, float | None, float | None, float | None, float | None
 ]
 Dtype = Literal["uint8", "float32"]
+MethodName = Literal["cqr", "csp", "mcqr", "cjp"]
 Quaternion = tuple[float, float, float, float]
+Parameters = TypeVar("Parameters", bound=Struct)
 
 
 class _Strict(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -74,7 +76,8 @@ class ModelSpec(_Strict, frozen=True):
 class PreprocessSpec(_Strict, frozen=True):
     """From a camera image to the model's input; ``in_graph`` names what the model does itself.
 
-    The model then computes (value - mean) / std per channel, in the order rgb, layout NCHW.
+    The model then computes (value - mean) / std per channel, in the order rgb, layout NCHW; both
+    are null for a given network whose normalisation only its graph knows.
     """
 
     height: Annotated[int, Meta(ge=16, le=4096)]
@@ -82,14 +85,18 @@ class PreprocessSpec(_Strict, frozen=True):
     colour_order: Literal["rgb"]
     interpolation: Literal["halve_then_linear_exact"]
     crop: Crop
-    mean: tuple[float, float, float]
-    std: tuple[Positive, Positive, Positive]
+    mean: tuple[float, float, float] | None
+    std: tuple[Positive, Positive, Positive] | None
     layout: Literal["nhwc"]
     in_graph: tuple[Literal["cast"], Literal["transpose"], Literal["normalise"]]
 
 
 class PoseLimits(_Strict, frozen=True):
-    """Lowest and highest plausible value per DoF, in the chart: outside is absurd."""
+    """Lowest and highest plausible value per DoF: outside is absurd.
+
+    In the chart of the pose; with ``tangent_predicted``, where a prediction's own rotation numbers
+    are zero, in the tangent at ``reference_q_xyzw`` (about nothing where that is null).
+    """
 
     lowest: Six
     highest: Six
@@ -109,7 +116,11 @@ class PoseSpec(_Strict, frozen=True):
 
 
 class Threshold(_Strict, frozen=True):
-    """q_hat for one confidence and scope; null is unbounded."""
+    """q_hat for one confidence and scope; null is unbounded.
+
+    With a two-sided score ``q_hat`` is for the lower side and ``q_hat_upper`` for the upper one;
+    for all others ``q_hat_upper`` is null as a whole.
+    """
 
     confidence: Annotated[float, Meta(gt=0, lt=1)]
     scope: Scope
@@ -118,17 +129,27 @@ class Threshold(_Strict, frozen=True):
 
 
 class SplitSpec(_Strict, frozen=True):
-    """Which frames had which role, so that the same test frames can be found again."""
+    """Which frames had which role, so that the same test frames can be found again.
 
+    ``purpose``: ``training`` deals all five roles; ``calibration`` deals val, cal and test alone,
+    on data that the network has not seen.
+    """
+
+    purpose: Literal["training", "calibration"]
     kind: Literal["random", "block", "sequence"]
     seed: Annotated[int, Meta(ge=0)]
     sha256: Sha256
 
 
 class CalibrationSpec(_Strict, frozen=True):
-    """Where the thresholds come from."""
+    """Where the thresholds come from.
+
+    ``joint`` is how six scores become one for the joint scope: the largest of them, made comparable
+    on val (``max``), or six thresholds at a sixth of the miscoverage (``bonferroni``).
+    """
 
     score: Text
+    joint: Literal["max", "bonferroni"]
     rule: Literal["pooled", "hierarchical", "weighted"]
     n: Annotated[int, Meta(ge=1, le=10**9)]
     n_sequences: Annotated[int, Meta(ge=1, le=10**9)]
@@ -148,11 +169,14 @@ class SelfTest(_Strict, frozen=True):
 
 
 class Provenance(_Strict, frozen=True):
-    """How the bundle was made: names and digests, never a path."""
+    """How the bundle was made: names and digests, never a path.
+
+    ``backbone`` is null for a given network that came as an ONNX file.
+    """
 
     created_with: dict[Text, Text]
     seed: Annotated[int, Meta(ge=0)]
-    backbone: Text
+    backbone: Text | None
     weights_sha256: Sha256 | None
     dataset: Text
     options: dict[Text, Text | int | float | bool | None]
@@ -163,7 +187,7 @@ class Calibration(_Strict, frozen=True):
 
     schema_version: Literal[1]
     name: Text
-    method: Literal["cqr", "csp", "mcqr", "cjp"]
+    method: MethodName
     model: ModelSpec
     preprocess: PreprocessSpec
     pose: PoseSpec
@@ -184,6 +208,16 @@ class Calibration(_Strict, frozen=True):
     def confidences(self, scope: Scope) -> tuple[float, ...]:
         """Return the confidences stored for this scope, ascending."""
         return tuple(sorted(entry.confidence for entry in self.thresholds if entry.scope == scope))
+
+    def parameters(self, kind: type[Parameters]) -> Parameters:
+        """Return ``method_parameters`` as the method's own struct.
+
+        Raises CalibrationFileError where they are another method's, or out of their ranges.
+        """
+        try:
+            return msgspec.convert(self.method_parameters, kind, strict=True)
+        except msgspec.ValidationError as error:
+            raise CalibrationFileError(f"method_parameters: {_one_line(str(error))}") from None
 
 
 @dataclass(frozen=True)
@@ -357,10 +391,12 @@ def _one_line(text: str) -> str:
 
 def _check_rules(calibration: Calibration) -> None:
     pose = calibration.pose
-    if (pose.rotation == "tangent_reference") != (pose.reference_q_xyzw is not None):
+    given = pose.reference_q_xyzw is not None
+    # An offset about the prediction needs no reference; its plausible limits may.
+    if pose.rotation != "tangent_predicted" and given != (pose.rotation == "tangent_reference"):
         raise CalibrationFileError(
-            "pose.reference_q_xyzw: expected a quaternion exactly where rotation is "
-            f"tangent_reference, found {_shown(pose.reference_q_xyzw)} with {pose.rotation}"
+            "pose.reference_q_xyzw: expected a quaternion with tangent_reference and null with "
+            f"euler_zyx, found {_shown(pose.reference_q_xyzw)} with {pose.rotation}"
         )
     if pose.reference_q_xyzw is not None:
         norm = math.sqrt(sum(component**2 for component in pose.reference_q_xyzw))

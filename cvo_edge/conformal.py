@@ -6,6 +6,8 @@ Every formula that turns scores into a threshold or sets into a figure is here, 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +18,10 @@ Array = NDArray[np.float64]
 
 # Absorbs the rounding of products like 20 * 0.95, which must count as exactly 19.
 _RANK_TOLERANCE = 1e-9
+
+# The joint scope compares degrees of freedom by this quantile of their scores on val.
+_SCALE_LEVEL = 0.9
+_LEAST_SCALE = 1e-6
 
 
 def conformal_rank(n: int, confidence: float) -> int:
@@ -59,16 +65,101 @@ def hierarchical_quantile(scores: ArrayLike, sequence: ArrayLike, confidence: fl
     return float(values[order[index]]) if index < values.size else math.inf
 
 
-def joint_scores(scores: ArrayLike, scales: ArrayLike) -> Array:
-    """One score a frame for all six DoF: max_d s_d / m_d. Shapes (n, 6), (6,) -> (n,).
+class JointScale(Protocol):
+    """Makes the scores of different degrees of freedom (and sides) comparable, and goes back.
 
-    ``scales`` m_d are positive and chosen on data other than the calibration set; the threshold of
-    DoF d is then m_d * q_hat, and the six intervals hold together.
+    Chosen on data other than the calibration set, so that the largest comparable score of a frame
+    is one exchangeable score; the threshold of each column is then its way back from one q_hat, and
+    all columns hold together.
     """
-    s, m = np.asarray(scores, dtype=np.float64), np.asarray(scales, dtype=np.float64)
-    if not (m > 0).all():
-        raise UsageError(f"joint scales: expected positive numbers, found {m.tolist()}")
-    return np.asarray((s / m).max(axis=-1))
+
+    def comparable(self, scores: Array) -> Array:
+        """Scores (n, sides, 6) -> comparable scores of the same shape, increasing in each."""
+
+    def thresholds(self, q_hat: float) -> Array:
+        """One threshold on comparable scores -> one for each side and DoF, (sides, 6)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearScale:
+    """s / m with positive scales m (sides, 6): for scores without bound, such as residuals."""
+
+    scales: Array
+
+    def __post_init__(self) -> None:
+        """Refuse scales that are not positive with a UsageError."""
+        if not (self.scales > 0).all():
+            raise UsageError(
+                f"joint scales: expected positive numbers, found {self.scales.tolist()}"
+            )
+
+    @classmethod
+    def fitted(cls, scores: Array) -> LinearScale:
+        """Scale by the 90 % quantile of |score| in scores (n, sides, 6), at least 1e-6."""
+        scales = np.quantile(np.abs(scores), _SCALE_LEVEL, axis=0)
+        return cls(np.asarray(np.maximum(scales, _LEAST_SCALE)))
+
+    def comparable(self, scores: Array) -> Array:
+        """As ``JointScale``."""
+        return np.asarray(scores / self.scales)
+
+    def thresholds(self, q_hat: float) -> Array:
+        """As ``JointScale``."""
+        return np.asarray(self.scales * q_hat)
+
+
+@dataclass(frozen=True, eq=False)
+class RankScale:
+    """The share of scores below, for scores that fill [0, ``top``], such as class scores.
+
+    Per column the strictly increasing piecewise linear map through (0, 0), (v_(i), i/(m + 1)) and
+    (top, 1), of slope 1 above; v are the scores of m other frames, ascending.
+    """
+
+    knots: tuple[tuple[tuple[Array, Array], ...], ...]
+
+    @classmethod
+    def fitted(cls, scores: Array, top: float) -> RankScale:
+        """Take the knots from scores (m, sides, 6); infinite ones only count."""
+        columns = [[_rank_knots(column, top) for column in side.T] for side in _by_side(scores)]
+        return cls(tuple(tuple(side) for side in columns))
+
+    def comparable(self, scores: Array) -> Array:
+        """As ``JointScale``."""
+        sides = zip(_by_side(scores), self.knots, strict=True)
+        mapped = [
+            [_piecewise(column, *knots) for column, knots in zip(side.T, row, strict=True)]
+            for side, row in sides
+        ]
+        return np.asarray(np.moveaxis(np.array(mapped), -1, 0))
+
+    def thresholds(self, q_hat: float) -> Array:
+        """As ``JointScale``; a hair larger, so that no rounding on the way excludes a score."""
+        back = [[_piecewise(np.array(q_hat), r, v) for v, r in row] for row in self.knots]
+        return np.asarray(np.array(back) + 1e-12)
+
+
+def _by_side(scores: Array) -> list[Array]:
+    return [scores[:, side] for side in range(scores.shape[1])]
+
+
+def _rank_knots(column: Array, top: float) -> tuple[Array, Array]:
+    """Scores (m,) of one column -> positions and ranks of the knots, both strictly increasing."""
+    finite = np.sort(column[np.isfinite(column)])
+    # Of equal scores the last has the rank.
+    last = np.append(finite[1:] > finite[:-1], True) if finite.size else np.empty(0, bool)
+    ranks = (np.arange(finite.size) + 1.0) / (column.size + 1.0)
+    inner = last & (finite > 0.0) & (finite < top)
+    return (
+        np.concatenate([[0.0], finite[inner], [top]]),
+        np.concatenate([[0.0], ranks[inner], [1.0]]),
+    )
+
+
+def _piecewise(values: Array, x: Array, y: Array) -> Array:
+    """Piecewise linear through (x, y), with slope 1 outside the knots; infinity stays."""
+    inside = np.interp(values, x, y)
+    return np.asarray(inside + np.minimum(values - x[0], 0.0) + np.maximum(values - x[-1], 0.0))
 
 
 def interval_score(width: ArrayLike, distance: ArrayLike, alpha: float) -> Array:

@@ -99,8 +99,13 @@ class Odometer:
         self.session: Session | None = Session(bundle.model_bytes, threads, calibration.model)
         reference = calibration.pose.reference_q_xyzw
         self.chart = Chart(
-            calibration.pose.rotation, None if reference is None else np.array(reference)
+            calibration.pose.rotation,
+            np.array(reference) if calibration.pose.rotation == "tangent_reference" else None,
         )
+        # A prediction is the origin of its own tangent: what is plausible needs a fixed one.
+        self._limits_chart = self.chart
+        if reference is not None and calibration.pose.rotation == "tangent_predicted":
+            self._limits_chart = Chart("tangent_reference", np.array(reference))
         self._lowest = np.array(calibration.pose.limits.lowest)
         self._highest = np.array(calibration.pose.limits.highest)
         self._seq = 0
@@ -227,9 +232,11 @@ class Odometer:
                 pose[3:] /= math.copysign(length, pose[6])
             else:
                 pose[3:] = math.nan
-            point = self.chart.point(pose)
+            point = plausible = self.chart.point(pose)
+            if self._limits_chart is not self.chart:
+                plausible = self._limits_chart.point(pose)
             # Written so that NaN (a zero quaternion) fails the check.
-            if not ((self._lowest <= point) & (point <= self._highest)).all():
+            if not ((self._lowest <= plausible) & (plausible <= self._highest)).all():
                 fault = Reason.POSE_IMPLAUSIBLE
         return Observation(outputs, pose, point, fault, 1e3 * (ready - start), 1e3 * (done - ready))
 

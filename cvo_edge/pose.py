@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import product
 from statistics import NormalDist
 from typing import Any, Literal
 
@@ -169,25 +170,28 @@ class ConformalSet:
             return np.asarray((self.lower <= y) & (y <= self.upper))
         return np.array(
             [
-                any(low <= value <= high for low, high in bands)
-                for value, bands in zip(y.tolist(), self.bands, strict=True)
+                any(low <= value <= high for low, high in row)
+                for value, row in zip(y.tolist(), self.bands, strict=True)
             ]
         )
 
     def within(self, lowest: Array, highest: Array) -> ConformalSet:
         """Return the set with its unbounded sides put at these limits, (6,) each."""
-        return ConformalSet(
-            np.where(np.isfinite(self.lower), self.lower, lowest),
-            np.where(np.isfinite(self.upper), self.upper, highest),
-            self.bands,
-            self.crossed,
-        )
+        lower = np.where(np.isfinite(self.lower), self.lower, lowest)
+        upper = np.where(np.isfinite(self.upper), self.upper, highest)
+        bands = self.bands
+        if bands is not None:
+            bands = tuple(
+                row if math.isfinite(row[-1][1] - row[0][0]) else ((low, high),)
+                for row, low, high in zip(bands, lower.tolist(), upper.tolist(), strict=True)
+            )
+        return ConformalSet(lower, upper, bands, self.crossed)
 
     def width(self) -> Array:
         """Measure of the set per DoF, (6,): of the union of its bands, not of their hull."""
         if self.bands is None:
             return self.upper - self.lower
-        return np.array([sum(high - low for low, high in bands) for bands in self.bands])
+        return np.array([sum(high - low for low, high in row) for row in self.bands])
 
     def distance(self, coordinates: ArrayLike) -> Array:
         """Distance of six coordinates (6,) to the nearest point of the set per DoF; 0 inside."""
@@ -196,8 +200,8 @@ class ConformalSet:
             return np.asarray(np.maximum(np.maximum(self.lower - y, y - self.upper), 0.0))
         return np.array(
             [
-                min(max(low - value, value - high, 0.0) for low, high in bands)
-                for value, bands in zip(y.tolist(), self.bands, strict=True)
+                min(max(low - value, value - high, 0.0) for low, high in row)
+                for value, row in zip(y.tolist(), self.bands, strict=True)
             ]
         )
 
@@ -264,6 +268,17 @@ class PoseInterval:
         """Disjoint intervals per DoF, or None where the set is its hull."""
         return self.region.bands
 
+    def position_boxes(self) -> Array:
+        """Shape (boxes, 3, 2): the region of the position, as disjoint boxes [low, high], metres.
+
+        The product of the bands of tx, ty and tz; a single box for a method without gaps. With the
+        joint scope the true position lies in one of them with the stated probability.
+        """
+        bands = self.bands or tuple(
+            ((low, high),) for low, high in zip(self.lower, self.upper, strict=True)
+        )
+        return np.array(list(product(*bands[:3])), dtype=np.float64)
+
     @property
     def bounded(self) -> bool:
         """Whether all twelve bounds are finite."""
@@ -307,7 +322,7 @@ class PoseInterval:
                 "lower": lower if bounded else _null_infinite(lower),
                 "upper": upper if bounded else _null_infinite(upper),
                 "bounded": bounded,
-                "bands": self.bands,
+                "bands": self.bands if bounded or self.bands is None else _null_bands(self.bands),
             }
         return {
             "seq": self.seq,
@@ -321,5 +336,9 @@ class PoseInterval:
         }
 
 
-def _null_infinite(values: list[float]) -> list[float | None]:
-    return [value if np.isfinite(value) else None for value in values]
+def _null_infinite(values: Iterable[float]) -> list[float | None]:
+    return [value if math.isfinite(value) else None for value in values]
+
+
+def _null_bands(bands: Bands) -> list[list[list[float | None]]]:
+    return [[_null_infinite(band) for band in row] for row in bands]

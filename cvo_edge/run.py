@@ -23,8 +23,9 @@ Array = NDArray[np.float64]
 class RunSummary:
     """Counts, latencies and, with ground truth, coverage: running sums, flat in memory.
 
-    Widths are the means over bounded frames; ``covered`` and ``compared`` count frames whose true
-    pose is known and that have a pose.
+    Widths are the means over bounded frames, without the gaps of a set that has some; ``disjoint``
+    counts frames with a gap in some degree of freedom; ``covered`` and ``compared`` count frames
+    whose true pose is known and that have a pose.
     """
 
     dof: tuple[str, ...]
@@ -35,6 +36,7 @@ class RunSummary:
     reasons: Counter[str] = field(default_factory=Counter)
     latency: LatencyProfile = field(default_factory=LatencyProfile)
     bounded: int = 0
+    disjoint: int = 0
     width_sum: Array = field(default_factory=lambda: np.zeros(6))
     compared: int = 0
     covered: Array = field(default_factory=lambda: np.zeros(6))
@@ -47,7 +49,8 @@ class RunSummary:
         self.latency.add(estimate.latency_ms)
         if estimate.bounded:
             self.bounded += 1
-            self.width_sum += estimate.upper - estimate.lower
+            self.width_sum += estimate.region.width()
+            self.disjoint += any(len(row) > 1 for row in estimate.bands or ())
         if truth is not None and estimate.pose is not None:
             inside = estimate.covers(truth)
             self.compared += 1
@@ -63,6 +66,8 @@ class RunSummary:
         """Return the summary as lines of text for a person."""
         counts = ", ".join(f"{self.statuses[status]} {status}" for status in Status)
         lines = [f"frames      {self.frames}: {counts}; {self.bounded} with finite bounds"]
+        if self.disjoint:
+            lines.append(f"bands       {self.disjoint} frames with a set in more than one piece")
         if self.reasons:
             found = ", ".join(f"{name} {count}" for name, count in sorted(self.reasons.items()))
             lines.append(f"remarks     {found}")

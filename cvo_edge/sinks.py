@@ -160,7 +160,7 @@ def _tum_line(estimate: PoseInterval) -> bytes:
 
 def _table_header(estimate: PoseInterval) -> bytes:
     names = "".join(
-        f"{name + unit:>18}" for name, unit in zip(estimate.chart.dof, _UNITS, strict=True)
+        f"{name + unit:>21}" for name, unit in zip(estimate.chart.dof, _UNITS, strict=True)
     )
     return f"{'frame':<26}{'status':<9}{names}\n".encode()
 
@@ -170,12 +170,14 @@ def _table_line(estimate: PoseInterval) -> bytes:
     line = f"{name:<26}{estimate.status:<9}"
     if estimate.pose is None:
         return f"{line}  {', '.join(estimate.reasons)}\n".encode()
-    for low, high, scale in zip(
-        estimate.lower.tolist(), estimate.upper.tolist(), _SCALES, strict=True
+    pieces = [len(row) for row in estimate.bands] if estimate.bands else [1] * 6
+    for low, high, scale, bands in zip(
+        estimate.lower.tolist(), estimate.upper.tolist(), _SCALES, pieces, strict=True
     ):
         finite = high - low < float("inf")
         cell = f"{scale * low:.1f} .. {scale * high:.1f}" if finite else "unbounded"
-        line += f"{cell:>18}"
+        # A set in pieces shows its hull and, in brackets, how many there are.
+        line += f"{cell if bands == 1 else f'{cell} ({bands})':>21}"
     return f"{line}\n".encode()
 
 

@@ -14,18 +14,25 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from cvo_edge.artifact import Calibration, Threshold
+from cvo_edge.conformal import JointScale
 from cvo_edge.heads.cjp import CjpHead
+from cvo_edge.heads.cqr import CqrHead
+from cvo_edge.heads.csp import CspHead
 from cvo_edge.pose import ConformalSet
 
 Array = NDArray[np.float64]
 
 
 class Head(Protocol):
-    """What every method provides to the odometer and to calibration."""
+    """What every method provides to the odometer and to calibration.
+
+    Scores have the shape (n, sides, 6): one side where a single threshold bounds a degree of
+    freedom's set, two where the lower and the upper bound have one each.
+    """
 
     parameters_type: ClassVar[type[Struct]]
     # Name and shape of every model output the method reads, all float32.
-    outputs: ClassVar[Mapping[str, tuple[int, ...]]]
+    outputs: Mapping[str, tuple[int, ...]]
 
     def __init__(self, calibration: Calibration) -> None:
         """Read the method's parameters; raises CalibrationFileError where they are not its own."""
@@ -33,8 +40,14 @@ class Head(Protocol):
     def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
         """Model inputs besides the image for frame number ``seq``."""
 
+    def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
+        """The confidence of each side's threshold in the marginal scope; None: never bounded."""
+
+    def joint_scale(self, scores: Array) -> JointScale:
+        """Scores (n, sides, 6) of val -> how columns are compared for the joint scope."""
+
     def scores(self, outputs: Mapping[str, NDArray[Any]], point: Array, truth: Array) -> Array:
-        """Nonconformity (n, 6) of outputs stacked over n frames; point and truth (n, 6)."""
+        """Outputs stacked over n frames; point and truth (n, 6) -> scores (n, sides, 6)."""
 
     def region(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
@@ -44,4 +57,6 @@ class Head(Protocol):
 
 HEADS: dict[str, type[Head]] = {
     "cjp": CjpHead,
+    "cqr": CqrHead,
+    "csp": CspHead,
 }

@@ -6,29 +6,46 @@ what was calibrated.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import CONFIDENCES, SixOrUnbounded, Threshold
+from cvo_edge.artifact import CONFIDENCES, Bundle, Calibration, SixOrUnbounded, Threshold
 from cvo_edge.conformal import (
     conformal_quantile,
     effective_sample_size,
     hierarchical_quantile,
-    joint_scores,
+    interval_score,
 )
-from cvo_edge.errors import SourceError
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.heads import HEADS, Head
+from cvo_edge.heads.cqr import Sides
 from cvo_edge.odometer import Observation, Odometer
+from cvo_edge.pose import Scope
+from cvo_edge.selftest import observe_selftest
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
 Rule = Literal["pooled", "hierarchical"]
+Joint = Literal["max", "bonferroni"]
 
-# The joint scope compares degrees of freedom by this quantile of their scores on val.
-_SCALE_LEVEL = 0.9
-_LEAST_SCALE = 1e-6
+SCOPES: tuple[Scope, Scope] = ("marginal", "joint")
+
+# What another score has to win on val by: smaller differences there are chance.
+_CLEARLY = 0.05
+
+
+class Candidate(NamedTuple):
+    """A score of the runtime's head and the ``method_parameters`` it goes with."""
+
+    score: str
+    parameters: Struct
 
 
 @dataclass(frozen=True)
@@ -87,16 +104,134 @@ def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
     )
 
 
+def calibrated(
+    draft: Calibration,
+    model_bytes: bytes,
+    dataset: PoseDataset,
+    roles: Mapping[str, NDArray[np.int64]],
+    candidates: Sequence[Candidate],
+) -> Calibration:
+    """Fill in score, thresholds and self-test of a draft, by running the model on val and cal.
+
+    The draft names rule, joint scope, split and data set; val decides among the candidates, see
+    ``chosen``.
+
+    Raises
+    ------
+    BundleMismatchError, CalibrationFileError
+        The model or a candidate is not of the draft's method.
+    SourceError
+        No frame of val or cal passes the checks.
+    """
+    first = with_candidate(draft, candidates[0])
+    with Odometer(Bundle(first, model_bytes)) as odometer:
+        val = observe(odometer, dataset, roles["val"])
+        cal = observe(odometer, dataset, roles["cal"])
+        selftest = {
+            name: tuple(float(f"{value:.9g}") for value in values.reshape(-1).tolist())
+            for name, values in observe_selftest(odometer).outputs.items()
+        }
+    scored = with_candidate(draft, chosen(draft, val, candidates))
+    head = HEADS[scored.method](scored)
+    cal_scores = head.scores(cal.outputs, cal.point, cal.truth)
+    val_scores = head.scores(val.outputs, val.point, val.truth)
+    source = scored.calibration
+    return replace(
+        scored,
+        thresholds=thresholds(
+            head, cal_scores, cal.sequence, val_scores, rule_of(scored), source.joint
+        ),
+        selftest=replace(scored.selftest, outputs=selftest),
+        calibration=replace(
+            source,
+            n=len(cal.indices),
+            n_sequences=len(np.unique(cal.sequence)),
+            n_effective=round(effective_frames(cal_scores, cal.sequence), 1),
+        ),
+    )
+
+
+def selected(
+    candidates: Sequence[Candidate], score: str | None, sides: Sides | None
+) -> tuple[Candidate, ...]:
+    """Return the candidates of this score, all if it is None, with these sides, if not None.
+
+    Raises UsageError for a score or sides that the method does not have.
+    """
+    names = list(dict.fromkeys(candidate.score for candidate in candidates))
+    if score is not None and score not in names:
+        raise UsageError(f"score: expected one of {', '.join(names)}, found {score}")
+    kept = [c for c in candidates if score in (None, c.score)]
+    if sides is None:
+        return tuple(kept)
+    if any("sides" not in c.parameters.__struct_fields__ for c in kept):
+        raise UsageError(f"sides: expected symmetric, as the method has no others, found {sides}")
+    return tuple(c._replace(parameters=replace(c.parameters, sides=sides)) for c in kept)
+
+
+def with_candidate(draft: Calibration, candidate: Candidate) -> Calibration:
+    """Return the draft with this score and its parameters, everything unbounded."""
+    symmetric = getattr(candidate.parameters, "sides", "symmetric") == "symmetric"
+    unbounded: SixOrUnbounded = (None,) * 6
+    entries = tuple(
+        Threshold(
+            confidence=confidence,
+            scope=scope,
+            q_hat=unbounded,
+            q_hat_upper=None if symmetric else unbounded,
+        )
+        for confidence in CONFIDENCES
+        for scope in SCOPES
+    )
+    return replace(
+        draft,
+        thresholds=entries,
+        method_parameters=msgspec.to_builtins(candidate.parameters),
+        calibration=replace(draft.calibration, score=candidate.score),
+    )
+
+
+def chosen(draft: Calibration, val: Observed, candidates: Sequence[Candidate]) -> Candidate:
+    """Return the first candidate, unless another's sets on val, thresholded there, clearly win.
+
+    By the interval score at 0.9 over each DoF's deviation; val is too small to tell closer ones
+    apart.
+    """
+    results = []
+    for candidate in candidates:
+        calibration = with_candidate(draft, candidate)
+        head = HEADS[calibration.method](calibration)
+        scores = head.scores(val.outputs, val.point, val.truth)
+        entry = _threshold(0.9, "marginal", marginal_thresholds(head, scores, 0.9, _pooled))
+        limits = calibration.pose.limits
+        lowest, highest = np.array(limits.lowest), np.array(limits.highest)
+        regions = [
+            head.region({k: v[row : row + 1] for k, v in val.outputs.items()}, point, entry).within(
+                lowest, highest
+            )
+            for row, point in enumerate(val.point)
+        ]
+        width = np.array([region.width() for region in regions])
+        distance = np.array([r.distance(y) for r, y in zip(regions, val.truth, strict=True)])
+        deviation = np.array(calibration.pose.standard_deviation)
+        results.append(float((interval_score(width, distance, 0.1) / deviation).mean()))
+    best = int(np.argmin(results))
+    return candidates[best if results[best] < (1.0 - _CLEARLY) * results[0] else 0]
+
+
 def thresholds(
+    head: Head,
     cal_scores: Array,
     cal_sequence: NDArray[np.int64],
     val_scores: Array,
     rule: Rule,
+    joint: Joint,
 ) -> tuple[Threshold, ...]:
-    """Both scopes at every confidence, from scores (n, 6) on cal; val gives the joint scales.
+    """Both scopes at every confidence, from scores (n, sides, 6) on cal.
 
     ``pooled`` counts frames, ``hierarchical`` sequences; what too few of them cannot support is
-    unbounded (null).
+    unbounded (null). Joint scope: ``max``, the largest score of a frame, made comparable on val;
+    or ``bonferroni``, six sets at a sixth of the miscoverage each.
     """
 
     def q_hat(scores: Array, confidence: float) -> float:
@@ -104,37 +239,76 @@ def thresholds(
             return hierarchical_quantile(scores, cal_sequence, confidence)
         return conformal_quantile(scores, confidence)
 
-    scales = joint_scales(val_scores)
-    joint = joint_scores(cal_scores, scales)
+    scale = head.joint_scale(val_scores)
     found = []
     for confidence in CONFIDENCES:
-        marginal = [q_hat(cal_scores[:, dof], confidence) for dof in range(6)]
-        found.append(_threshold(confidence, "marginal", np.array(marginal)))
-        found.append(_threshold(confidence, "joint", scales * q_hat(joint, confidence)))
+        marginal = marginal_thresholds(head, cal_scores, confidence, q_hat)
+        found.append(_threshold(confidence, "marginal", marginal))
+        if joint == "bonferroni":
+            together = marginal_thresholds(head, cal_scores, 1.0 - (1.0 - confidence) / 6, q_hat)
+        else:
+            used = _used_sides(head)
+            largest = scale.comparable(cal_scores)[:, used].max(axis=(1, 2))
+            together = np.full(cal_scores.shape[1:], np.inf)
+            together[used] = scale.thresholds(q_hat(largest, confidence))[used]
+        found.append(_threshold(confidence, "joint", together))
     return tuple(found)
 
 
-def joint_scales(val_scores: Array) -> Array:
-    """m_d, shape (6,): the 90 % quantile of |score| of each DoF on val, at least 1e-6."""
-    scales = np.quantile(np.abs(val_scores), _SCALE_LEVEL, axis=0)
-    return np.asarray(np.maximum(scales, _LEAST_SCALE))
+def marginal_thresholds(
+    head: Head, scores: Array, confidence: float, q_hat: Callable[[Array, float], float]
+) -> Array:
+    """Scores (n, sides, 6) -> thresholds (sides, 6), infinite where unbounded."""
+    found = np.full(scores.shape[1:], np.inf)
+    for side, level in enumerate(head.side_confidences(confidence)):
+        if level is not None:
+            found[side] = [q_hat(scores[:, side, dof], level) for dof in range(6)]
+    return found
 
 
-def effective_frames(cal_scores: Array, cal_sequence: NDArray[np.int64]) -> float:
-    """Independent frames that the calibration set is worth: the least over the six DoF.
+def rule_of(calibration: Calibration) -> Rule:
+    """The calibration rule of a bundle; raises UsageError for one that is not computed here."""
+    rule = calibration.calibration.rule
+    if rule == "weighted":
+        raise UsageError("rule: expected pooled or hierarchical, found weighted")
+    return rule
 
-    Summed over sequences, which are independent of each other.
+
+def effective_frames(scores: Array, sequence: NDArray[np.int64]) -> float:
+    """Independent frames that scores (n, sides, 6) are worth: the least over all columns.
+
+    Summed over sequences, which are independent of each other. An infinite score counts as the
+    largest finite one.
     """
+    columns = [
+        np.minimum(column, column[np.isfinite(column)].max(initial=0.0))
+        for column in scores.reshape(len(scores), -1).T
+    ]
     return min(
-        sum(
-            effective_sample_size(cal_scores[cal_sequence == number, dof])
-            for number in np.unique(cal_sequence)
-        )
-        for dof in range(6)
+        sum(effective_sample_size(column[sequence == number]) for number in np.unique(sequence))
+        for column in columns
     )
 
 
-def _threshold(confidence: float, scope: Literal["marginal", "joint"], values: Array) -> Threshold:
-    six = tuple(float(value) if np.isfinite(value) else None for value in values)
-    q_hat: SixOrUnbounded = (six[0], six[1], six[2], six[3], six[4], six[5])
-    return Threshold(confidence=confidence, scope=scope, q_hat=q_hat, q_hat_upper=None)
+def _used_sides(head: Head) -> NDArray[np.bool_]:
+    return np.array([level is not None for level in head.side_confidences(0.9)])
+
+
+def _pooled(scores: Array, confidence: float) -> float:
+    return conformal_quantile(scores, confidence)
+
+
+def _threshold(confidence: float, scope: Scope, values: Array) -> Threshold:
+    """Thresholds (sides, 6), infinite where unbounded, as they are stored."""
+    sides = [_six_or_unbounded(row) for row in values]
+    return Threshold(
+        confidence=confidence,
+        scope=scope,
+        q_hat=sides[0],
+        q_hat_upper=sides[1] if len(sides) == 2 else None,
+    )
+
+
+def _six_or_unbounded(values: Array) -> SixOrUnbounded:
+    a, b, c, d, e, f = (float(value) if np.isfinite(value) else None for value in values)
+    return (a, b, c, d, e, f)

@@ -27,6 +27,8 @@ class MethodName(StrEnum):
     """Methods that can be trained."""
 
     CJP = "cjp"
+    CQR = "cqr"
+    CSP = "csp"
 
 
 class SplitName(StrEnum):
@@ -79,6 +81,51 @@ class IntervalFormName(StrEnum):
     PROPER = "proper"
     MEAN = "mean"
     SUM = "sum"
+
+
+class LabelsName(StrEnum):
+    """What the classifier is trained to answer."""
+
+    ORDINAL = "ordinal"
+    ONE_HOT = "one_hot"
+
+
+class ForestName(StrEnum):
+    """One forest for all degrees of freedom, or one each."""
+
+    SHARED = "shared"
+    PER_DOF = "per_dof"
+
+
+class ResidualsName(StrEnum):
+    """Which frames the forest's residuals come from."""
+
+    AUTO = "auto"
+    CROSS_FITTED = "cross_fitted"
+    HELD_OUT = "held_out"
+
+
+class JointName(StrEnum):
+    """How six scores become the joint scope."""
+
+    MAX = "max"
+    BONFERRONI = "bonferroni"
+
+
+class SidesName(StrEnum):
+    """Which bounds are calibrated, and how."""
+
+    SYMMETRIC = "symmetric"
+    ASYMMETRIC = "asymmetric"
+    LOWER = "lower"
+    UPPER = "upper"
+
+
+class RotationName(StrEnum):
+    """What the rotation numbers of a given network are."""
+
+    TANGENT_PREDICTED = "tangent_predicted"
+    EULER_ZYX = "euler_zyx"
 
 
 class RuleName(StrEnum):
@@ -144,23 +191,69 @@ def train(
         int | None, typer.Option(min=0, help="Epochs of training the backbone, too; 0: frozen.")
     ] = None,
     steps: Annotated[int | None, typer.Option(min=100, help="Steps of training the head.")] = None,
-    latent_size: Annotated[int, typer.Option(min=1, help="The paper's is 3.")] = 16,
-    latent: Annotated[LatentName, typer.Option(help="The paper's is sample.")] = LatentName.MEAN,
+    cache: Annotated[
+        Path | None,
+        typer.Option(help="Folder of features that several runs share; else in the run's."),
+    ] = None,
+    latent_size: Annotated[
+        int | None, typer.Option(min=1, help="cjp: dimension of the latent, 16; the paper's is 3.")
+    ] = None,
+    latent: Annotated[
+        LatentName | None, typer.Option(help="cjp: mean by default; the paper's is sample.")
+    ] = None,
     bounds: Annotated[
-        BoundsName, typer.Option(help="free: three outputs, sorted.")
-    ] = BoundsName.SOFTPLUS,
+        BoundsName | None, typer.Option(help="cjp: softplus by default; free: sorted outputs.")
+    ] = None,
     sharpness: Annotated[
-        float, typer.Option(min=0, max=1, help="lambda of the calibration loss.")
-    ] = 0.5,
+        float | None, typer.Option(min=0, max=1, help="cjp: lambda of the calibration loss, 0.5.")
+    ] = None,
     gate: Annotated[
-        GateName, typer.Option(help="literal: the paper's Eq. 5a.")
-    ] = GateName.CORRECTED,
+        GateName | None, typer.Option(help="cjp: corrected by default; literal: Eq. 5a.")
+    ] = None,
     interval_form: Annotated[
-        IntervalFormName, typer.Option(help="mean: the paper's text.")
-    ] = IntervalFormName.PROPER,
-    kl_weight: Annotated[float, typer.Option(min=0, help="beta of the divergence.")] = 1e-3,
+        IntervalFormName | None, typer.Option(help="cjp: proper by default; mean: the paper's.")
+    ] = None,
+    kl_weight: Annotated[
+        float | None, typer.Option(min=0, help="cjp: beta of the divergence, 0.001.")
+    ] = None,
+    quantiles: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="cqr: levels of the bounds before conformalising, 0.05 0.95."),
+    ] = None,
+    trees: Annotated[int | None, typer.Option(min=1, help="cqr: trees of the forest, 100.")] = None,
+    leaf_size: Annotated[
+        int | None, typer.Option(min=1, help="cqr: least rows in a leaf, 10.")
+    ] = None,
+    split_features: Annotated[
+        float | None, typer.Option(help="cqr: share of inputs tried at a split, 0.33.")
+    ] = None,
+    components: Annotated[
+        int | None, typer.Option(min=0, help="cqr: principal components the forest sees, 58.")
+    ] = None,
+    forest: Annotated[
+        ForestName | None, typer.Option(help="cqr: shared by default; per_dof: the paper's.")
+    ] = None,
+    residuals: Annotated[
+        ResidualsName | None,
+        typer.Option(help="cqr: cross_fitted below 1500 frames by default, else held_out."),
+    ] = None,
+    forest_copies: Annotated[
+        int | None, typer.Option(min=0, help="cqr: augmented copies among the forest's rows.")
+    ] = None,
+    classes: Annotated[
+        int | None, typer.Option(min=2, help="csp: K, classes of each degree of freedom.")
+    ] = None,
+    labels: Annotated[
+        LabelsName | None, typer.Option(help="csp: ordinal by default; one_hot: the paper's.")
+    ] = None,
+    label_sigma: Annotated[
+        float | None, typer.Option(min=0.01, help="csp: deviation of ordinal labels, in classes.")
+    ] = None,
 ) -> None:
-    """Train a method on a data set; interrupted, the same command goes on."""
+    """Train a method on a data set; interrupted, the same command goes on.
+
+    Options that begin with the name of a method belong to that method.
+    """
     from cvo_export.configure import configure
     from cvo_export.train import train as train_run
 
@@ -183,28 +276,54 @@ def train(
         steps=steps,
         head={
             "latent_size": latent_size,
-            "latent": latent.value,
-            "bounds": bounds.value,
+            "latent": latent,
+            "bounds": bounds,
             "sharpness": sharpness,
-            "gate": gate.value,
-            "interval_form": interval_form.value,
+            "gate": gate,
+            "interval_form": interval_form,
             "kl_weight": kl_weight,
+            "quantiles": quantiles,
+            "trees": trees,
+            "leaf_size": leaf_size,
+            "split_features": split_features,
+            "components": components,
+            "forest": forest,
+            "residuals": residuals,
+            "forest_copies": forest_copies,
+            "classes": classes,
+            "labels": labels,
+            "label_sigma": label_sigma,
         },
     )
     with show_progress() as progress:
-        run = train_run(run_dir, config, progress)
+        run = train_run(run_dir, config, progress, cache)
     print(*run.lines(), sep="\n", file=sys.stderr)
+
+
+RuleOption = Annotated[
+    RuleName | None,
+    typer.Option(help="hierarchical for a split by sequence, else pooled."),
+]
+JointOption = Annotated[JointName, typer.Option(help="How the joint scope is made.")]
+ScoreOption = Annotated[
+    str | None,
+    typer.Option(help="cjp, cqr: normalised, additive; csp: aps, lac, raps. val decides."),
+]
+SidesOption = Annotated[
+    SidesName | None, typer.Option(help="cqr: symmetric by default; which bounds are calibrated.")
+]
+NameOption = Annotated[str | None, typer.Option(help="The folder's name by default.")]
 
 
 @app.command()
 def publish(
     run_dir: Annotated[Path, typer.Argument(help="A finished run.", show_default=False)],
     bundle: Annotated[Path, typer.Argument(help="Bundle folder to write.", show_default=False)],
-    rule: Annotated[
-        RuleName | None,
-        typer.Option(help="hierarchical for a run split by sequence, else pooled."),
-    ] = None,
-    name: Annotated[str | None, typer.Option(help="The folder's name by default.")] = None,
+    rule: RuleOption = None,
+    joint: JointOption = JointName.MAX,
+    score: ScoreOption = None,
+    sides: SidesOption = None,
+    name: NameOption = None,
     dataset: Annotated[
         str | None, typer.Option(help="Where the data set is now, if it has moved.")
     ] = None,
@@ -214,9 +333,62 @@ def publish(
     from cvo_export.publish import publish as publish_run
     from cvo_export.run import load_run
 
-    run = load_run(run_dir, dataset)
     calibration = publish_run(
-        run, bundle, name or bundle.resolve().name, rule.value if rule else None
+        load_run(run_dir, dataset),
+        bundle,
+        name or bundle.resolve().name,
+        rule=rule.value if rule else None,
+        joint=joint.value,
+        score=score,
+        sides=sides.value if sides else None,
+    )
+    print(*inspect_lines(calibration), sep="\n")
+
+
+@app.command()
+def calibrate(
+    model: Annotated[
+        Path, typer.Argument(help="An ONNX file, or a bundle folder.", show_default=False)
+    ],
+    dataset: DatasetArgument,
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder to write.", show_default=False)],
+    split: Annotated[
+        SplitName | None,
+        typer.Option(help="sequence where there are three or more, else block."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Decides the split.")] = 0,
+    rule: RuleOption = None,
+    joint: JointOption = JointName.MAX,
+    score: ScoreOption = None,
+    sides: SidesOption = None,
+    rotation: Annotated[
+        RotationName, typer.Option(help="ONNX file: chart of its bounds.")
+    ] = RotationName.TANGENT_PREDICTED,
+    crop: Annotated[CropName, typer.Option(help="ONNX file: what it sees.")] = CropName.NONE,
+    name: NameOption = None,
+) -> None:
+    """Calibrate a network that is there, on data that it has not seen: your own, or a bundle's.
+
+    An ONNX file has the input image, uint8 [1, height, width, 3], RGB, and the outputs pose [1, 7]
+    and, for intervals that adapt, lower and upper [1, 6].
+    """
+    from cvo_edge.describe import inspect_lines
+    from cvo_export.datasets import open_dataset
+    from cvo_export.recalibrate import recalibrate
+
+    calibration = recalibrate(
+        model,
+        open_dataset(dataset),
+        bundle,
+        name or bundle.resolve().name,
+        kind=split.value if split else None,
+        seed=seed,
+        rule=rule.value if rule else None,
+        joint=joint.value,
+        score=score,
+        sides=sides.value if sides else None,
+        rotation=rotation.value,
+        crop=crop.value,
     )
     print(*inspect_lines(calibration), sep="\n")
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, cast
+
+import msgspec
 
 from cvo_edge.errors import UsageError
 from cvo_edge.preprocess import Crop
 from cvo_export.augment import AugmentConfig
 from cvo_export.backbone import NO_WEIGHTS, TIMM_WEIGHTS, BackboneConfig, Normalisation
 from cvo_export.datasets import open_dataset
-from cvo_export.heads.cjp import CjpConfig
+from cvo_export.heads import METHODS, HeadConfig
 from cvo_export.run import TrainConfig
 from cvo_export.splits import Kind, default_kind
 
@@ -31,9 +33,10 @@ def configure(
     head: dict[str, Any],
     **given: float | None,
 ) -> TrainConfig:
-    """Fill in the defaults; ``given`` are TrainConfig's numbers, None for its own default.
+    """Fill in the defaults; ``given`` are TrainConfig's numbers, ``head`` the method's options.
 
-    Raises UsageError for texts that are not of their form.
+    None stands for the default of each. Raises UsageError for texts that are not of their form, and
+    for an option that belongs to another method.
     """
     width, height = _pair(size, "size", "WIDTHxHEIGHT")
     if min(width, height) < 32 or max(width, height) > 4096:
@@ -43,10 +46,7 @@ def configure(
     numbers: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     augment = {key: numbers.pop(key) for key in ("rotation_deg", "light") if key in numbers}
     kind = split or default_kind(open_dataset(dataset))
-    if method != "cjp":
-        raise UsageError(f"method: expected cjp, found {method}")
     return TrainConfig(
-        method="cjp",
         dataset=dataset,
         split=kind,
         seed=seed,
@@ -58,9 +58,26 @@ def configure(
         ),
         weights=weights,
         augment=AugmentConfig(**augment),
-        head=CjpConfig(**head),
+        head=_head_config(method, head),
         **numbers,
     )
+
+
+def _head_config(method: str, options: dict[str, Any]) -> HeadConfig:
+    if method not in METHODS:
+        raise UsageError(f"method: expected one of {', '.join(METHODS)}, found {method}")
+    kind = METHODS[method].config
+    given = {name: value for name, value in options.items() if value is not None}
+    foreign = [name for name in given if name not in kind.__struct_fields__]
+    if foreign:
+        raise UsageError(
+            f"{foreign[0].replace('_', '-')}: expected an option of {method}, found one of another "
+            "method"
+        )
+    try:
+        return cast("HeadConfig", msgspec.convert({"method": method, **given}, kind))
+    except msgspec.ValidationError as error:
+        raise UsageError(str(error)) from None
 
 
 def _pair(text: str, what: str, form: str) -> tuple[int, int]:

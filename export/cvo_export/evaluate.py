@@ -46,7 +46,7 @@ def evaluate(
     split: Split | None = None
     indices = np.arange(len(dataset))
     if subset == "test":
-        split = same_split(dataset, recorded.kind, recorded.seed, recorded.sha256)
+        split = same_split(dataset, recorded)
         indices = split.roles["test"]
     with Odometer(
         bundle, threads=threads, confidence=first.confidence, scope=first.scope
@@ -192,7 +192,8 @@ def _recalibrated(
         seen = observe(odometer, dataset, split.roles[role])
         scores.append((odometer.head.scores(seen.outputs, seen.point, seen.truth), seen.sequence))
     (cal_scores, cal_sequence), (val_scores, _) = scores
-    return thresholds(cal_scores, cal_sequence, val_scores, rule)
+    joint = odometer.calibration.calibration.joint
+    return thresholds(odometer.head, cal_scores, cal_sequence, val_scores, rule, joint)
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ def cached_copies(
 
     One file a copy, written whole or not at all, so that an interrupted run goes on with the next.
     """
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     features, poses = [], []
     for number in range(copies + 1):
         path = folder / f"copy-{number:03d}.npz"

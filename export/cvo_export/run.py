@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple, cast
 
 import msgspec
 import torch
+from torch import Tensor, nn
 
+from cvo_edge.artifact import MethodName
 from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.preprocess import Crop
 from cvo_export.augment import AugmentConfig
 from cvo_export.backbone import Backbone, BackboneConfig
 from cvo_export.datasets import PoseDataset, open_dataset
-from cvo_export.heads.cjp import CjpConfig, CjpNetwork
-from cvo_export.splits import Kind, Split, make_split, same_split
-from cvo_export.target import PoseGraph, Target
+from cvo_export.heads import METHODS, ExportedHead, HeadConfig, Setting
+from cvo_export.splits import Kind, Split, make_split, read_split_spec, same_split
+from cvo_export.target import Target
 
 CONFIG_FILE = "config.json"
 SPLIT_FILE = "split.json"
@@ -29,8 +31,8 @@ class TrainConfig:
 
     Attributes
     ----------
-    method, dataset, split, seed
-        What is trained on what; the seed decides split, training and noise.
+    dataset, split, seed
+        What is trained on; the seed decides split, training and noise.
     height, width, crop
         The model's input and which part of an image it shows.
     backbone, weights
@@ -38,7 +40,7 @@ class TrainConfig:
     augment, copies
         How the augmented copies of each training frame are changed, and how many there are.
     head
-        The network behind the features and its loss.
+        The method and its own options: the network behind the features and its loss.
     steps, batch_size, learning_rate, weight_decay
         AdamW on cached features; the rate rises over 50 steps and falls as a cosine.
     warm_up_steps
@@ -50,9 +52,9 @@ class TrainConfig:
         computed anew and the head trained once more.
     """
 
-    method: Literal["cjp"]
     dataset: str
     split: Kind
+    head: HeadConfig
     seed: int = 0
     height: int = 192
     width: int = 256
@@ -61,7 +63,6 @@ class TrainConfig:
     weights: str = "timm"
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     copies: int = 12
-    head: CjpConfig = field(default_factory=CjpConfig)
     steps: int = 6000
     warm_up_steps: int = 200
     batch_size: int = 64
@@ -71,13 +72,39 @@ class TrainConfig:
     fine_tune: int = 0
     backbone_learning_rate: float = 3e-4
 
+    @property
+    def method(self) -> MethodName:
+        """Name of the method, the tag of its options."""
+        return cast("MethodName", self.head.__struct_config__.tag)
+
+
+class History(NamedTuple):
+    """One evaluation on val."""
+
+    lesson: str
+    phase: int
+    step: int
+    loss: float
+    val_score: float
+
+
+class PoseGraph(nn.Module):
+    """What is exported: images (n, height, width, 3), uint8 RGB -> the method's outputs."""
+
+    def __init__(self, backbone: Backbone, head: ExportedHead) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.head = head
+
+    def forward(self, image: Tensor, *extra: Tensor) -> tuple[Tensor, ...]:
+        """Return the head's outputs, of the names in ``head.output_names``."""
+        outputs: tuple[Tensor, ...] = self.head(self.backbone(image), *extra)
+        return outputs
+
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: what it was asked for and what it learned.
-
-    ``history`` has an entry per evaluation on val: phase, step, loss, val_score.
-    """
+    """A finished run: what it was asked for, what it learned, and how that went."""
 
     config: TrainConfig
     dataset: PoseDataset
@@ -85,7 +112,7 @@ class Run:
     target: Target
     graph: PoseGraph
     weights_sha256: str | None
-    history: list[dict[str, float]]
+    history: list[History]
 
     def save(self, run_dir: Path) -> None:
         """Write what training learned, whole or not at all."""
@@ -93,10 +120,11 @@ class Run:
         partial = run_dir / (NETWORK_FILE + ".partial")
         torch.save(
             {
-                "graph": self.graph.state_dict(),
+                "backbone": self.graph.backbone.state_dict(),
+                "head": self.graph.head.state_dict(),
                 "target": [torch.from_numpy(values) for values in target],
                 "weights_sha256": self.weights_sha256,
-                "history": self.history,
+                "history": [tuple(entry) for entry in self.history],
             },
             partial,
         )
@@ -106,10 +134,10 @@ class Run:
         """Return what was trained as lines of text for a person."""
         counts = ", ".join(f"{role} {indices.size}" for role, indices in self.split.roles.items())
         skipped = ", ".join(f"{count} {reason}" for reason, count in self.dataset.skipped.items())
-        last_phase = max(entry["phase"] for entry in self.history)
+        last = self.history[-1]
         best = min(
-            (entry for entry in self.history if entry["phase"] == last_phase),
-            key=lambda entry: entry["val_score"],
+            (e for e in self.history if (e.lesson, e.phase) == (last.lesson, last.phase)),
+            key=lambda entry: entry.val_score,
         )
         parameters = sum(parameter.numel() for parameter in self.graph.parameters())
         return [
@@ -117,7 +145,7 @@ class Run:
             "skipped",
             f"split       {self.split.kind}: {counts}",
             f"network     {self.config.backbone.name}, {parameters / 1e6:.2f} M parameters",
-            f"best        val score {best['val_score']:.3f} at step {best['step']:.0f}",
+            f"best        val score {best.val_score:.3f} at step {best.step} ({best.lesson})",
         ]
 
 
@@ -167,16 +195,19 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
         raise UsageError(f"{run_dir}: expected a finished run, found no {NETWORK_FILE}")
     try:
         config = msgspec.json.decode((run_dir / CONFIG_FILE).read_bytes(), type=TrainConfig)
-        recorded = msgspec.json.decode((run_dir / SPLIT_FILE).read_bytes())
+        recorded = read_split_spec(run_dir / SPLIT_FILE)
         stored = torch.load(path, weights_only=True)
     # torch.load raises what its unpickler and its zip reader happen to raise.
     except Exception as error:  # noqa: BLE001
         line = " ".join(str(error).split())[:120]
         raise UsageError(f"{run_dir}: expected the files of a finished run, found {line}") from None
     opened = open_dataset(dataset or config.dataset)
-    split = same_split(opened, config.split, config.seed, recorded["sha256"])
+    split = same_split(opened, recorded)
     target = Target(*(values.numpy() for values in stored["target"]))
     backbone = Backbone(config.backbone, config.height, config.width)
-    graph = PoseGraph(backbone, CjpNetwork(backbone.size, config.head), target).eval()
-    graph.load_state_dict(stored["graph"])
-    return Run(config, opened, split, target, graph, stored["weights_sha256"], stored["history"])
+    backbone.load_state_dict(stored["backbone"])
+    setting = Setting(backbone.size, target, config.seed)
+    head = METHODS[config.method].restore(setting, config.head, stored["head"])
+    graph = PoseGraph(backbone, head).eval()
+    history = [History(*entry) for entry in stored["history"]]
+    return Run(config, opened, split, target, graph, stored["weights_sha256"], history)

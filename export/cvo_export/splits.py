@@ -2,7 +2,8 @@
 
 ``train`` fits the networks; ``fit`` is for models of residuals (CJP trains on train and fit
 together); ``val`` decides every choice (early stopping, score, scales); ``cal`` gives the
-thresholds and nothing else; ``test`` gives the final figures and nothing else.
+thresholds and nothing else; ``test`` gives the final figures and nothing else. Where a finished
+network is only calibrated, on data that it has not seen, there are no frames to train on.
 """
 
 from __future__ import annotations
@@ -14,15 +15,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.artifact import SplitSpec
 from cvo_edge.errors import SourceError, UsageError
 from cvo_export.datasets import PoseDataset
 
 Kind = Literal["random", "block", "sequence"]
-ROLES = ("train", "fit", "val", "cal", "test")
-SHARES = {"train": 0.4, "fit": 0.1, "val": 0.1, "cal": 0.2, "test": 0.2}
+Purpose = Literal["training", "calibration"]
+SHARES: dict[Purpose, dict[str, float]] = {
+    "training": {"train": 0.4, "fit": 0.1, "val": 0.1, "cal": 0.2, "test": 0.2},
+    "calibration": {"val": 0.1, "cal": 0.7, "test": 0.2},
+}
 
 _BLOCKS = 20
 # Frames dropped on the two sides of a border between blocks of different roles.
@@ -40,6 +46,7 @@ class Split:
 
     kind: Kind
     seed: int
+    purpose: Purpose
     roles: Mapping[str, Indices]
 
     def digest(self, dataset: PoseDataset) -> str:
@@ -47,12 +54,16 @@ class Split:
         text = json.dumps(self._names(dataset), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
+    def spec(self, dataset: PoseDataset) -> SplitSpec:
+        """Return what a bundle says of it."""
+        return SplitSpec(
+            purpose=self.purpose, kind=self.kind, seed=self.seed, sha256=self.digest(dataset)
+        )
+
     def write(self, path: Path, dataset: PoseDataset) -> None:
         """Write kind, seed and the frame names of every role as JSON."""
         document = {
-            "kind": self.kind,
-            "seed": self.seed,
-            "sha256": self.digest(dataset),
+            **msgspec.to_builtins(self.spec(dataset)),
             "roles": self._names(dataset),
         }
         path.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
@@ -64,46 +75,72 @@ class Split:
         }
 
 
-def make_split(dataset: PoseDataset, kind: Kind, seed: int) -> Split:
+def read_split_spec(path: Path) -> SplitSpec:
+    """Read what ``Split.write`` wrote, without the frame names."""
+    document = msgspec.json.decode(path.read_bytes())
+    del document["roles"]
+    return msgspec.convert(document, SplitSpec)
+
+
+def make_split(dataset: PoseDataset, kind: Kind, seed: int, purpose: Purpose = "training") -> Split:
     """Give every frame at most one role.
 
     ``random``: frames, exchangeable by construction but flattering on video; ``block``: 20
     contiguous blocks with gaps where roles change; ``sequence``: whole sequences, the data set's
-    own test list respected. The same data set, kind and seed give the same split.
+    own test list respected. The same data set and arguments give the same split.
 
     Raises UsageError where the data set is too small for the kind.
     """
     generator = np.random.default_rng(seed)
     if kind == "random":
-        roles = _random(dataset, generator)
+        roles = _random(dataset, generator, SHARES[purpose])
     elif kind == "block":
-        roles = _block(dataset, generator)
+        roles = _block(dataset, generator, SHARES[purpose])
     else:
-        roles = _sequence(dataset, generator)
-    empty = [role for role in ROLES if roles[role].size == 0]
+        roles = _sequence(dataset, generator, SHARES[purpose])
+    empty = [role for role, indices in roles.items() if indices.size == 0]
     if empty:
         raise UsageError(
             f"split {kind}: expected frames for every role, found none for {', '.join(empty)} "
             f"among {len(dataset)} frames of {len(dataset.sequence_names)} sequence(s)"
         )
-    return Split(kind, seed, roles)
+    return Split(kind, seed, purpose, roles)
 
 
-def default_kind(dataset: PoseDataset) -> Kind:
-    """Return ``sequence`` where there are enough sequences for the five roles, else ``block``."""
-    return "sequence" if len(dataset.sequence_names) >= len(ROLES) else "block"
+def default_kind(dataset: PoseDataset, purpose: Purpose = "training") -> Kind:
+    """Return ``sequence`` where there are enough sequences for the roles, else ``block``."""
+    return "sequence" if len(dataset.sequence_names) >= len(SHARES[purpose]) else "block"
 
 
-def same_split(dataset: PoseDataset, kind: Kind, seed: int, digest: str) -> Split:
+def same_split(dataset: PoseDataset, recorded: SplitSpec) -> Split:
     """Make a recorded split again; raises SourceError where the data set is not the same."""
-    split = make_split(dataset, kind, seed)
+    split = make_split(dataset, recorded.kind, recorded.seed, recorded.purpose)
     found = split.digest(dataset)
-    if found != digest:
+    if found != recorded.sha256:
         raise SourceError(
-            f"{dataset.name}: expected the frames of the recorded {kind} split {digest[:12]}..., "
-            f"found {found[:12]}...; is it another data set? --subset all needs no split"
+            f"{dataset.name}: expected the frames of the recorded {recorded.kind} split "
+            f"{recorded.sha256[:12]}..., found {found[:12]}...; is it another data set? "
+            "--subset all needs no split"
         )
     return split
+
+
+def deal_folds(dataset: PoseDataset, split: Split, indices: Indices, count: int) -> list[Indices]:
+    """Positions within ``indices`` (frame numbers), dealt into folds by the unit of the split.
+
+    Frames for a random split; for the others whole sequences or, where there are too few, runs of
+    frames that follow one another, as neighbouring frames would tell on each other.
+    """
+    unit = np.arange(indices.size)
+    if split.kind != "random":
+        unit = dataset.sequence[indices]
+        if np.unique(unit).size < count:
+            unit = np.cumsum(np.diff(indices, prepend=indices[:1]) != 1)
+        if np.unique(unit).size < count:
+            unit = np.arange(indices.size) * 3 * count // indices.size
+    names, unit = np.unique(unit, return_inverse=True)
+    fold_of = np.random.default_rng((split.seed, count)).permutation(names.size) % count
+    return [np.flatnonzero(fold_of[unit] == number) for number in range(count)]
 
 
 def _counts(total: int, shares: Mapping[str, float]) -> dict[str, int]:
@@ -125,21 +162,25 @@ def _deal(items: Indices, counts: Mapping[str, int]) -> dict[str, Indices]:
     return dict(zip(counts, np.split(items, stops[:-1]), strict=True))
 
 
-def _random(dataset: PoseDataset, generator: np.random.Generator) -> dict[str, Indices]:
+def _random(
+    dataset: PoseDataset, generator: np.random.Generator, shares: Mapping[str, float]
+) -> dict[str, Indices]:
     shuffled = generator.permutation(len(dataset))
-    dealt = _deal(shuffled, _counts(len(dataset), SHARES))
+    dealt = _deal(shuffled, _counts(len(dataset), shares))
     return {role: np.sort(indices) for role, indices in dealt.items()}
 
 
-def _block(dataset: PoseDataset, generator: np.random.Generator) -> dict[str, Indices]:
+def _block(
+    dataset: PoseDataset, generator: np.random.Generator, shares: Mapping[str, float]
+) -> dict[str, Indices]:
     blocks: list[Indices] = []
     for number in range(len(dataset.sequence_names)):
         frames = np.flatnonzero(dataset.sequence == number)
         pieces = max(1, round(_BLOCKS * frames.size / len(dataset)))
         blocks += [block for block in np.array_split(frames, pieces) if block.size]
-    dealt = _deal(generator.permutation(len(blocks)), _counts(len(blocks), SHARES))
+    dealt = _deal(generator.permutation(len(blocks)), _counts(len(blocks), shares))
     role_of = {int(block): role for role, members in dealt.items() for block in members}
-    roles: dict[str, list[Indices]] = {role: [] for role in ROLES}
+    roles: dict[str, list[Indices]] = {role: [] for role in shares}
     for index, block in enumerate(blocks):
         start = _GAP_AFTER if _border(dataset, blocks, role_of, index - 1) else 0
         stop = block.size - (_GAP_BEFORE if _border(dataset, blocks, role_of, index) else 0)
@@ -148,7 +189,8 @@ def _block(dataset: PoseDataset, generator: np.random.Generator) -> dict[str, In
     if surviving < _LEAST_SURVIVING * len(dataset):
         raise UsageError(
             f"split block: expected at least {_LEAST_SURVIVING:.0%} of the frames to survive the "
-            f"gaps, found {surviving} of {len(dataset)}; the recording is too short"
+            f"gaps, found {surviving} of {len(dataset)}; the recording is too short (--split "
+            "random deals single frames)"
         )
     empty = np.empty(0, np.int64)
     return {role: np.concatenate(parts) if parts else empty for role, parts in roles.items()}
@@ -164,23 +206,25 @@ def _border(
     return bool(same) and role_of[index] != role_of[index + 1]
 
 
-def _sequence(dataset: PoseDataset, generator: np.random.Generator) -> dict[str, Indices]:
+def _sequence(
+    dataset: PoseDataset, generator: np.random.Generator, shares: Mapping[str, float]
+) -> dict[str, Indices]:
     everything = range(len(dataset.sequence_names))
     test = np.array(sorted(dataset.own_test), dtype=np.int64)
     pool = sorted((dataset.own_train or frozenset(everything)) - dataset.own_test)
     shuffled = generator.permutation(np.array(pool, dtype=np.int64))
-    shares = dict(SHARES)
+    dealt_shares = dict(shares)
     if test.size:
-        del shares["test"]
-    counts = _counts(shuffled.size, shares)
-    if len(everything) >= _MANY_SEQUENCES:
+        del dealt_shares["test"]
+    counts = _counts(shuffled.size, dealt_shares)
+    if "fit" in shares and len(everything) >= _MANY_SEQUENCES:
         counts = _more_calibration(counts)
     dealt = _deal(shuffled, counts)
     if test.size:
         dealt["test"] = test
     return {
         role: np.flatnonzero(np.isin(dataset.sequence, dealt[role])).astype(np.int64)
-        for role in ROLES
+        for role in shares
     }
 
 

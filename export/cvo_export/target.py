@@ -12,13 +12,9 @@ from torch import Tensor, nn
 from cvo_edge import geometry
 from cvo_edge.errors import UsageError
 from cvo_edge.pose import Chart
-from cvo_export.backbone import Backbone
-from cvo_export.heads.cjp import CjpDecoded, CjpNetwork
+from cvo_export.bundle import MAX_SPREAD_RAD
 
 Array = NDArray[np.float64]
-
-# Beyond this spread about the mean rotation the tangent at it comes near its cut at pi.
-MAX_SPREAD_RAD = 2.0
 
 
 @dataclass(frozen=True)
@@ -68,13 +64,11 @@ def fit_target(poses: Array) -> Target:
     return Target(reference, coordinates.mean(axis=0), deviation)
 
 
-class PoseGraph(nn.Module):
-    """What is exported: images (n, height, width, 3) -> pose (n, 7), lower and upper (n, 6)."""
+class PoseDecoder(nn.Module):
+    """Standardised numbers -> metres and radians, and the pose they are."""
 
-    def __init__(self, backbone: Backbone, network: CjpNetwork, target: Target) -> None:
+    def __init__(self, target: Target) -> None:
         super().__init__()
-        self.backbone = backbone
-        self.decoded = CjpDecoded(network)
         for name, values in (
             ("mean", target.mean),
             ("std", target.std),
@@ -85,14 +79,14 @@ class PoseGraph(nn.Module):
         self.std: Tensor
         self.left: Tensor
 
-    def forward(self, image: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return pose, lower and upper in metres and radians; noise in ``sample`` mode only."""
-        point, lower, upper = (
-            values * self.std + self.mean for values in self.decoded(self.backbone(image), noise)
-        )
-        # R = R_reference Exp(r), as quaternions.
-        q_xyzw = _exp(point[:, 3:]) @ self.left.T
-        return torch.cat([point[:, :3], q_xyzw], dim=1), lower, upper
+    def forward(self, standardised: Tensor) -> Tensor:
+        """Standardised (n, 6) -> coordinates (n, 6), m and rad."""
+        return standardised * self.std + self.mean
+
+    def pose(self, coordinates: Tensor) -> Tensor:
+        """Coordinates (n, 6) -> poses (n, 7): R = R_reference Exp(r), as quaternions."""
+        q_xyzw = _exp(coordinates[:, 3:]) @ self.left.T
+        return torch.cat([coordinates[:, :3], q_xyzw], dim=1)
 
 
 def _exp(rotvec: Tensor) -> Tensor:

@@ -1,34 +1,43 @@
 """One training loop: features, steps, early stopping on val, checkpoints.
 
-Batches are a function of (seed, phase, step) and noise comes from a generator whose state is in
-the checkpoint: an interrupted run that goes on ends with the same numbers as one that never was.
+A run is a series of lessons, most often one. Batches are a function of (seed, lesson, phase, step)
+and noise comes from a generator whose state is in the checkpoint: an interrupted run that goes on
+ends with the same numbers as one that never was.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from cvo_edge.conformal import conformal_quantile, interval_score
+from cvo_edge.errors import UsageError
 from cvo_export.backbone import Backbone, load_weights
+from cvo_export.datasets import PoseDataset
 from cvo_export.features import FeatureExtractor, ModelImages, Progress, cached_copies
-from cvo_export.heads.cjp import CjpDecoded, CjpLoss, CjpNetwork
-from cvo_export.run import Run, TrainConfig, claim_run, open_run
-from cvo_export.target import PoseGraph, Target, fit_target
+from cvo_export.heads import METHODS, Setting
+from cvo_export.heads.base import L, Learner
+from cvo_export.run import History, PoseGraph, Run, TrainConfig, claim_run, open_run
+from cvo_export.splits import deal_folds
+from cvo_export.target import Target, fit_target
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Batch = Callable[[np.random.Generator], tuple[Tensor, Tensor]]
 
-CHECKPOINT_FILE = "checkpoint.pt"
 FEATURES_FOLDER = "features"
 
 # Evaluations on val in a phase, and how many without a new best end it. The learning rate falls as
@@ -40,8 +49,11 @@ _PATIENCE = 20
 _IMAGE_BATCH = 16
 
 
-def train(run_dir: Path, config: TrainConfig, progress: Progress) -> Run:
+def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | None = None) -> Run:
     """Train, or go on where an interrupted run of the same configuration stopped.
+
+    Features of the pretrained network are kept in the run's folder, or in a folder of ``cache``
+    that all runs with the same frames, network and augmentation share.
 
     Raises UsageError where ``run_dir`` holds another configuration.
     """
@@ -54,41 +66,128 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress) -> Run:
     claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
     trainer = _Trainer(
-        run_dir,
-        config,
-        backbone,
-        CjpNetwork(backbone.size, config.head),
-        target,
-        ModelImages(dataset, indices, *size),
-        ModelImages(dataset, split.roles["val"], *size),
-        progress,
+        _Material(
+            run_dir,
+            _features_folder(run_dir, cache, config, weights_sha256, dataset, indices),
+            config,
+            backbone,
+            target,
+            ModelImages(dataset, indices, *size),
+            ModelImages(dataset, split.roles["val"], *size),
+            progress,
+        ),
+        n_train=split.roles["train"].size,
+        folds=partial(deal_folds, dataset, split, indices),
     )
-    history = trainer.fit()
-    graph = PoseGraph(backbone, trainer.network, target).eval()
-    run = Run(config, dataset, split, target, graph, weights_sha256, history)
+    head = METHODS[config.method].train(trainer, config.head)
+    graph = PoseGraph(backbone, head).eval()
+    run = Run(config, dataset, split, target, graph, weights_sha256, trainer.history)
     run.save(run_dir)
     return run
 
 
 @dataclass
-class _Trainer:
-    """The phases of a run: the head on cached features; with fine-tuning all, then it again."""
+class _Material:
+    """What all lessons of a run learn from, and where they are kept."""
 
     run_dir: Path
+    features_folder: Path
     config: TrainConfig
     backbone: Backbone
-    network: CjpNetwork
     target: Target
     images: ModelImages
     val_images: ModelImages
     progress: Progress
 
-    def fit(self) -> list[dict[str, float]]:
-        """Run all phases, from the checkpoint if there is one; returns the history."""
-        self.both = nn.ModuleDict({"backbone": self.backbone, "network": self.network})
-        self.loss = CjpLoss(self.config.head)
-        self.history: list[dict[str, float]] = []
+    def __post_init__(self) -> None:
         self.val_y = self.target.standardised(self.val_images.poses)
+        self._cached: dict[int, tuple[NDArray[np.float16], Array, Tensor]] = {}
+
+    def cached(self, phase: int) -> tuple[NDArray[np.float16], Array, Tensor]:
+        """Features and poses of all copies, features of val, by the backbone as it is in a phase.
+
+        Shapes (copies + 1, n, size), (copies + 1, n, 7) and (n_val, size).
+        """
+        if phase not in self._cached:
+            config = self.config
+            extractor = FeatureExtractor(self.backbone, config.height, config.width)
+            features, poses = cached_copies(
+                # A backbone that has learnt is this run's alone.
+                self.run_dir / f"{FEATURES_FOLDER}-{phase}" if phase else self.features_folder,
+                self.images,
+                extractor,
+                config.augment,
+                config.copies,
+                config.seed,
+                self.progress,
+            )
+            val = np.stack([extractor(image) for image in self.val_images.images])
+            self._cached = {phase: (features, poses, torch.from_numpy(val))}
+        return self._cached[phase]
+
+
+class _Trainer:
+    """The lessons of a run; see ``cvo_export.heads.base.Lessons``.
+
+    A run that fine-tunes its backbone has one lesson: another would learn from other features.
+    """
+
+    def __init__(
+        self, material: _Material, n_train: int, folds: Callable[[int], list[Indices]]
+    ) -> None:
+        self.setting = Setting(material.backbone.size, material.target, material.config.seed)
+        self.n_images = len(material.images)
+        self.n_train = n_train
+        self.fine_tuned = material.config.fine_tune > 0
+        self.folds = folds
+        self.history: list[History] = []
+        self._material = material
+
+    def learn(self, name: str, build: Callable[[], L], rows: Indices | None = None) -> L:
+        """Train what ``build`` makes, with random numbers of its own name."""
+        if self.fine_tuned and self.history:
+            raise UsageError(f"fine-tune: expected a method of one lesson, found another, {name}")
+        torch.manual_seed(_lesson_seed(self.setting.seed, name))
+        learner = build()
+        everything = np.arange(len(self._material.images))
+        lesson = _Lesson(self._material, name, learner, everything if rows is None else rows)
+        self.history += lesson.fit()
+        return learner
+
+    def poses(self) -> Array:
+        """Poses of the training images."""
+        return self._material.images.poses
+
+    def features(self) -> tuple[NDArray[np.float16], Array]:
+        """Features and poses of all copies of the training images, by the backbone as learnt."""
+        features, poses, _ = self._material.cached(self._last_phase)
+        return features, poses
+
+    def val(self) -> tuple[Tensor, Array]:
+        """Features and standardised poses of val, by the backbone as learnt."""
+        return self._material.cached(self._last_phase)[2], self._material.val_y
+
+    @property
+    def _last_phase(self) -> int:
+        return 2 if self.fine_tuned else 0
+
+
+class _Lesson:
+    """The phases of a lesson: the head on cached features; with fine-tuning all, then it again."""
+
+    def __init__(self, material: _Material, name: str, learner: Learner, rows: Indices) -> None:
+        self.material = material
+        self.config = material.config
+        self.name = name
+        self.learner = learner
+        self.rows = rows
+        self.both = nn.ModuleDict({"backbone": material.backbone, "learner": learner})
+        self.history: list[History] = []
+        self._seed = _lesson_seed(self.config.seed, name)
+        self._path = material.run_dir / f"checkpoint-{name}.pt"
+
+    def fit(self) -> list[History]:
+        """Run all phases, from the checkpoint if there is one; returns the history."""
         checkpoint = self._read_checkpoint()
         first = checkpoint["phase"] if checkpoint else 0
         for phase in range(first, 3 if self.config.fine_tune else 1):
@@ -101,68 +200,62 @@ class _Trainer:
 
     def _fit_head(self, phase: int, state: dict[str, Any] | None) -> None:
         """Train the head on features of augmented copies, computed by the present backbone."""
-        extractor = FeatureExtractor(self.backbone, self.config.height, self.config.width)
-        features, poses = cached_copies(
-            self.run_dir / f"{FEATURES_FOLDER}-{phase}",
-            self.images,
-            extractor,
-            self.config.augment,
-            self.config.copies,
-            self.config.seed,
-            self.progress,
-        )
-        val = torch.from_numpy(np.stack([extractor(image) for image in self.val_images.images]))
+        if state is not None and state["ended"]:
+            self._keep(state["best"])
+            return
+        features, poses, val = self.material.cached(phase)
         if phase == 0:
-            self._standardise(features)
+            self.learner.standardise.fit(features[:, self.rows])
         x = torch.from_numpy(features)
-        y = torch.tensor(self.target.standardised(poses), dtype=torch.float32)
+        y = torch.tensor(self.material.target.standardised(poses), dtype=torch.float32)
 
         def batch(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
             copy = generator.integers(x.shape[0], size=self.config.batch_size)
-            frame = generator.integers(x.shape[1], size=self.config.batch_size)
+            frame = self.rows[generator.integers(self.rows.size, size=self.config.batch_size)]
             return x[copy, frame].float(), y[copy, frame]
 
-        groups = [{"params": list(self.network.parameters()), "peak": self.config.learning_rate}]
-        self._loop(phase, "head", groups, self.config.steps, batch, lambda _: val, state)
+        groups = [{"params": list(self.learner.parameters()), "peak": self.config.learning_rate}]
+        self._loop(phase, self.name, groups, self.config.steps, batch, lambda _: val, state)
 
     def _fit_all(self, phase: int, state: dict[str, Any] | None) -> None:
         """Train backbone and head together on fresh augmented images."""
+        images, val_images = self.material.images, self.material.val_images
         # Batch statistics of 16 images are too noisy: the running ones stay.
-        self.backbone.eval()
+        self.material.backbone.eval()
 
         def batch(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
-            rows = generator.integers(len(self.images), size=_IMAGE_BATCH)
+            rows = self.rows[generator.integers(self.rows.size, size=_IMAGE_BATCH)]
             augment = self.config.augment
             drawn = [
-                self.images.augmented(row, augment.graded(generator.random()), generator)
+                images.augmented(row, augment.graded(generator.random()), generator)
                 for row in rows.tolist()
             ]
-            y = self.target.standardised(np.stack([pose for _, pose in drawn]))
+            y = self.material.target.standardised(np.stack([pose for _, pose in drawn]))
             stacked = torch.from_numpy(np.stack([image for image, _ in drawn]))
-            return self.backbone(stacked), torch.tensor(y, dtype=torch.float32)
+            return self.material.backbone(stacked), torch.tensor(y, dtype=torch.float32)
 
         def val_features(averaged: nn.Module) -> Tensor:
             with torch.no_grad():
                 backbone = averaged.get_submodule("backbone")
-                images = torch.from_numpy(self.val_images.images)
-                starts = range(0, len(images), _IMAGE_BATCH)
-                return torch.cat([backbone(images[i : i + _IMAGE_BATCH]) for i in starts])
+                val = torch.from_numpy(val_images.images)
+                starts = range(0, len(val), _IMAGE_BATCH)
+                return torch.cat([backbone(val[i : i + _IMAGE_BATCH]) for i in starts])
 
         groups = [
             # The head is trained already: a full rate would undo it.
-            {"params": list(self.network.parameters()), "peak": 0.3 * self.config.learning_rate},
+            {"params": list(self.learner.parameters()), "peak": 0.3 * self.config.learning_rate},
             {
-                "params": list(self.backbone.parameters()),
+                "params": list(self.material.backbone.parameters()),
                 "peak": self.config.backbone_learning_rate,
             },
         ]
-        steps = self.config.fine_tune * math.ceil(len(self.images) / _IMAGE_BATCH)
+        steps = self.config.fine_tune * math.ceil(self.rows.size / _IMAGE_BATCH)
         self._loop(phase, "fine-tuning", groups, steps, batch, val_features, state)
 
     def _loop(
         self,
         phase: int,
-        name: str,
+        what: str,
         groups: list[dict[str, Any]],
         steps: int,
         batch: Batch,
@@ -187,92 +280,102 @@ class _Trainer:
                 break
             for group in optimiser.param_groups:
                 group["lr"] = group["peak"] * _schedule(step, steps)
-            self.network.train()
-            self.loss.train()
-            features, y = batch(np.random.default_rng((config.seed, phase, step)))
-            noise = torch.randn(len(y), config.head.latent_size)
-            prediction = self.network(features, noise)
+            self.learner.train()
+            features, y = batch(np.random.default_rng((self._seed, phase, step)))
             warm_up = phase == 0 and step < config.warm_up_steps
-            value = self.loss(prediction, y, warm_up=warm_up)
+            value = self.learner.loss(features, y, warm_up)
             optimiser.zero_grad()
-            value.backward()
+            value.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
             averaged.update_parameters(self.both)
             if (step + 1) % every == 0 or step + 1 == steps:
                 module = averaged.module
-                head = module.get_submodule("network")
-                score = val_score(cast("CjpNetwork", head), val_features(module), self.val_y)
+                learner = cast("Learner", module.get_submodule("learner")).eval()
+                with torch.no_grad():
+                    score = learner.val_score(val_features(module), self.material.val_y)
                 if score < best["score"]:
                     weights = {key: value.clone() for key, value in module.state_dict().items()}
                     best = {"score": score, "weights": weights, "count": 0}
                 else:
                     best["count"] += 1
-                entry = {"phase": phase, "step": step + 1, "loss": value.item()}
-                self.history.append({**entry, "val_score": score})
-                self._write_checkpoint(phase, step + 1, optimiser, averaged, best)
-                self.progress(f"{name}, val score {score:.3f}", step + 1, steps)
-        self.both.load_state_dict(best["weights"])
-        self.network.eval()
+                self.history.append(History(self.name, phase, step + 1, value.item(), float(score)))
+                ended = step + 1 == steps or best["count"] >= _PATIENCE
+                self._write_checkpoint(phase, step + 1, ended, optimiser, averaged, best)
+                self.material.progress(f"{what}, val score {score:.3f}", step + 1, steps)
+        self._keep(best)
 
-    def _standardise(self, features: NDArray[np.float16]) -> None:
-        deviation = features.std((0, 1), dtype=np.float64)
-        self.network.feature_mean.copy_(torch.from_numpy(features.mean((0, 1), dtype=np.float64)))
-        # A feature that is nearly always zero would be blown up where it is not.
-        self.network.feature_std.copy_(torch.from_numpy(deviation + 0.1 * deviation.mean()))
+    def _keep(self, best: dict[str, Any]) -> None:
+        self.both.load_state_dict(best["weights"])
+        self.learner.eval()
 
     def _write_checkpoint(
         self,
         phase: int,
         step: int,
+        ended: bool,
         optimiser: torch.optim.Optimizer,
         averaged: AveragedModel,
         best: dict[str, Any],
     ) -> None:
-        path = self.run_dir / CHECKPOINT_FILE
-        partial = path.with_suffix(".partial")
+        unfinished = self._path.with_suffix(".partial")
         torch.save(
             {
                 "phase": phase,
                 "step": step,
+                "ended": ended,
                 "weights": self.both.state_dict(),
-                "loss": self.loss.state_dict(),
                 "optimiser": optimiser.state_dict(),
                 "averaged": averaged.state_dict(),
                 "best": best,
-                "history": self.history,
+                "history": [tuple(entry) for entry in self.history],
                 "torch_rng": torch.get_rng_state(),
             },
-            partial,
+            unfinished,
         )
-        partial.replace(path)
+        unfinished.replace(self._path)
 
     def _read_checkpoint(self) -> dict[str, Any] | None:
-        path = self.run_dir / CHECKPOINT_FILE
-        if not path.is_file():
+        if not self._path.is_file():
             return None
-        state: dict[str, Any] = torch.load(path, weights_only=True)
+        state: dict[str, Any] = torch.load(self._path, weights_only=True)
         self.both.load_state_dict(state["weights"])
-        self.loss.load_state_dict(state["loss"])
-        self.history = state["history"]
+        self.history = [History(*entry) for entry in state["history"]]
         return state
+
+
+def _features_folder(
+    run_dir: Path,
+    cache: Path | None,
+    config: TrainConfig,
+    weights_sha256: str | None,
+    dataset: PoseDataset,
+    indices: Indices,
+) -> Path:
+    """Where the pretrained network's features of these frames are kept.
+
+    In a shared cache the name is a digest of everything that decides them, but for the pixels.
+    """
+    # Random weights are the run's own.
+    if cache is None or weights_sha256 is None:
+        return run_dir / f"{FEATURES_FOLDER}-0"
+    decisive = {
+        "weights": weights_sha256,
+        "backbone": msgspec.to_builtins(config.backbone),
+        "image": [config.height, config.width, config.crop],
+        "augment": [msgspec.to_builtins(config.augment), config.copies, config.seed],
+        "dataset": dataset.name,
+        "intrinsics": dataset.intrinsics,
+        "frames": [dataset.frame_names[index] for index in indices.tolist()],
+        "poses": dataset.poses[indices].tolist(),
+    }
+    text = json.dumps(decisive, sort_keys=True)
+    return cache / hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def _lesson_seed(seed: int, name: str) -> int:
+    """One seed a lesson, so that none depends on how much randomness those before it used."""
+    return int(np.random.SeedSequence((seed, zlib.crc32(name.encode()))).generate_state(1)[0])
 
 
 def _schedule(step: int, steps: int) -> float:
     return min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
-
-
-def val_score(network: CjpNetwork, features: Tensor, y: Array) -> float:
-    """Mean interval score at 90 % on val (n, 6), standardised, bounds conformalised on val itself.
-
-    Close to what the finished bundle will be judged by: there the score (additive here) is chosen
-    afterwards, and thresholds come from other frames than the ones judged.
-    """
-    network.eval()
-    with torch.no_grad():
-        found = CjpDecoded(network)(features)
-    _, lower, upper = (values.numpy().astype(np.float64) for values in found)
-    scores = np.maximum(lower - y, y - upper)
-    q_hat = np.array([conformal_quantile(scores[:, dof], 0.9) for dof in range(6)])
-    lower, upper = lower - q_hat, upper + q_hat
-    distance = np.maximum(np.maximum(lower - y, y - upper), 0.0)
-    return float(interval_score(upper - lower, distance, 0.1).mean())

@@ -78,7 +78,7 @@ def test_a_set_is_exactly_where_the_score_is_at_most_the_threshold(bundle):
         region = made.region(seen)
         for y in np.linspace(-3, 3, 61):
             truth = np.full((1, 6), y)
-            score = made.head.scores(seen.outputs, seen.point[None], truth)[0]
+            score = made.head.scores(seen.outputs, seen.point[None], truth)[0, 0]
             np.testing.assert_array_equal(score <= 0.5, region.covers(truth[0]))
 
 

@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cvo_edge.conformal import (
+    LinearScale,
+    RankScale,
     conformal_quantile,
     conformal_rank,
     effective_sample_size,
     hierarchical_quantile,
     interval_score,
-    joint_scores,
 )
 from cvo_edge.errors import UsageError
 
@@ -83,10 +84,39 @@ def test_nan_scores_are_refused():
         hierarchical_quantile([math.nan], [0], 0.5)
 
 
-def test_joint_score_is_the_largest_scaled_one():
-    np.testing.assert_array_equal(joint_scores([[1.0, 4.0], [-1.0, -8.0]], [1.0, 2.0]), [2.0, -1.0])
+def test_linear_scale_divides_and_goes_back():
+    scale = LinearScale(np.array([[1.0, 2.0]]))
+    comparable = scale.comparable(np.array([[[1.0, 4.0]], [[-1.0, -8.0]]]))
+    np.testing.assert_array_equal(comparable, [[[1.0, 2.0]], [[-1.0, -4.0]]])
+    np.testing.assert_array_equal(scale.thresholds(3.0), [[3.0, 6.0]])
     with pytest.raises(UsageError, match="positive"):
-        joint_scores([[1.0, 1.0]], [1.0, 0.0])
+        LinearScale(np.array([[1.0, 0.0]]))
+
+
+def test_linear_scale_is_the_ninety_percent_quantile_of_the_size():
+    scores = np.random.default_rng(0).standard_normal((200, 2, 6)) * np.arange(1, 7)
+    expected = np.quantile(np.abs(scores), 0.9, axis=0)
+    np.testing.assert_array_equal(LinearScale.fitted(scores).scales, expected)
+
+
+unit_scores = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=40)
+
+
+@given(unit_scores, unit_scores, st.sampled_from([1.0, 1.7]))
+def test_rank_scale_keeps_the_order_and_goes_back_without_losing_a_score(fitted, values, top):
+    scale = RankScale.fitted(np.array(fitted).reshape(-1, 1, 1), top)
+    s = np.sort(values).reshape(-1, 1, 1)
+    comparable = scale.comparable(s)[:, 0, 0]
+    assert (np.diff(comparable) >= 0).all()
+    for value, mapped in zip(s[:, 0, 0], comparable, strict=True):
+        assert value <= scale.thresholds(mapped)[0, 0] <= value + 1e-9
+
+
+def test_rank_scale_passes_through_its_knots_and_has_slope_one_above():
+    scale = RankScale.fitted(np.array([0.5, 0.2, 0.2, np.inf]).reshape(-1, 1, 1), 1.0)
+    values = np.array([0.0, 0.2, 0.5, 1.0, 1.5, np.inf]).reshape(-1, 1, 1)
+    expected = [0.0, 0.4, 0.6, 1.0, 1.5, np.inf]
+    np.testing.assert_allclose(scale.comparable(values)[:, 0, 0], expected)
 
 
 @given(st.floats(-5, 5), st.floats(0, 5), st.floats(-10, 10))

@@ -9,6 +9,7 @@ import pytest
 
 from cvo_export.augment import AugmentConfig
 from cvo_export.backbone import BackboneConfig
+from cvo_export.heads.cjp import CjpConfig
 from cvo_export.publish import publish
 from cvo_export.run import Run, TrainConfig
 from cvo_export.train import train
@@ -18,7 +19,7 @@ DATASET = "synthetic:room,flights=8,frames=40,size=64x48"
 
 def tiny_config(**changes: Any) -> TrainConfig:
     values: dict[str, Any] = {
-        "method": "cjp",
+        "head": CjpConfig(),
         "dataset": DATASET,
         "split": "random",
         "height": 48,

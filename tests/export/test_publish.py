@@ -35,7 +35,7 @@ def test_thresholds_are_order_statistics_of_the_runtimes_scores(tiny_bundle, tin
         for confidence in CONFIDENCES:
             stored = odometer.calibration.threshold(confidence, "marginal").q_hat
             for dof in range(6):
-                expected = conformal_quantile(scores[:, dof], confidence)
+                expected = conformal_quantile(scores[:, 0, dof], confidence)
                 assert stored[dof] == (expected if np.isfinite(expected) else None)
 
 
@@ -67,7 +67,7 @@ def test_torch_and_the_graph_agree_and_another_graph_does_not(tiny_bundle, tiny_
     image = np.random.default_rng(0).integers(0, 255, (1, 48, 64, 3)).astype(np.uint8)
     assert check_parity(tiny_run.graph, session, [{"image": image}], ["image"]) < 1e-4
     other = copy.deepcopy(tiny_run.graph)
-    other.mean += 1.0
+    other.head.decoder.mean += 1.0
     with pytest.raises(GateError, match="agree"):
         check_parity(other, session, [{"image": image}], ["image"])
 
@@ -75,7 +75,7 @@ def test_torch_and_the_graph_agree_and_another_graph_does_not(tiny_bundle, tiny_
 def test_a_bundle_is_replaced_whole_and_anything_else_is_refused(tiny_run, tiny_bundle, tmp_path):
     target = tmp_path / "bundle"
     publish(tiny_run, target, "first")
-    publish(tiny_run, target, "second", "hierarchical")
+    publish(tiny_run, target, "second", rule="hierarchical")
     assert read_calibration(target).name == "second"
     assert read_calibration(target).calibration.rule == "hierarchical"
     assert [path.name for path in tmp_path.iterdir()] == ["bundle"]

@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from cvo_edge.errors import SourceError, UsageError
 from cvo_export.datasets import PoseDataset
-from cvo_export.splits import ROLES, SHARES, default_kind, make_split, same_split
+from cvo_export.splits import SHARES, deal_folds, default_kind, make_split, same_split
+
+ROLES = tuple(SHARES["training"])
 
 
 def dataset(lengths, own_train=(), own_test=(), prefix="f"):
@@ -48,7 +50,7 @@ def test_no_frame_has_two_roles_and_every_role_has_frames(lengths, kind, seed):
 def test_random_shares_are_exact_on_a_thousand_frames():
     split = make_split(dataset([1000]), "random", 0)
     assert [split.roles[role].size for role in ROLES] == [400, 100, 100, 200, 200]
-    assert sum(SHARES.values()) == pytest.approx(1.0)
+    assert all(sum(shares.values()) == pytest.approx(1.0) for shares in SHARES.values())
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -109,11 +111,45 @@ def test_the_same_seed_gives_the_same_split_and_another_another(kind):
     made = dataset([150] * 8)
     first, again, other = (make_split(made, kind, seed) for seed in (3, 3, 4))
     assert first.digest(made) == again.digest(made) != other.digest(made)
-    assert same_split(made, kind, 3, first.digest(made)).kind == kind
+    assert same_split(made, first.spec(made)).kind == kind
 
 
 def test_another_data_set_is_not_taken_for_the_recorded_one():
     made, renamed = dataset([1000]), dataset([1000], prefix="g")
-    digest = make_split(made, "random", 0).digest(made)
+    recorded = make_split(made, "random", 0).spec(made)
     with pytest.raises(SourceError, match="another data set"):
-        same_split(renamed, "random", 0, digest)
+        same_split(renamed, recorded)
+
+
+@pytest.mark.parametrize("kind", ["random", "block", "sequence"])
+def test_for_calibration_no_frame_is_spent_on_training(kind):
+    made = dataset([100] * 10)
+    split = make_split(made, kind, 0, "calibration")
+    assert set(split.roles) == {"val", "cal", "test"}
+    joined = np.concatenate(list(split.roles.values()))
+    assert len(set(joined.tolist())) == joined.size
+    assert split.roles["cal"].size > 0.5 * joined.size
+    assert same_split(made, split.spec(made)).roles["cal"].tolist() == split.roles["cal"].tolist()
+
+
+@pytest.mark.parametrize("kind", ["random", "block", "sequence"])
+def test_folds_hold_every_training_frame_once_and_keep_units_whole(kind):
+    made = dataset([120] * 10)
+    split = make_split(made, kind, 0)
+    indices = np.concatenate([split.roles["train"], split.roles["fit"]])
+    folds = deal_folds(made, split, indices, 3)
+    assert sorted(np.concatenate(folds).tolist()) == list(range(indices.size))
+    assert all(fold.size for fold in folds)
+    if kind != "random":
+        of = [set(made.sequence[indices[fold]].tolist()) for fold in folds]
+        assert sum(map(len, of)) == len(set.union(*of))
+
+
+def test_folds_of_one_recording_are_runs_of_frames():
+    made = dataset([1000])
+    split = make_split(made, "block", 0)
+    indices = np.concatenate([split.roles["train"], split.roles["fit"]])
+    for fold in deal_folds(made, split, indices, 3):
+        frames = np.sort(indices[fold])
+        # A fold begins and ends seldom: its frames follow one another.
+        assert (np.diff(frames) > 1).sum() < 0.1 * frames.size

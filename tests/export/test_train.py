@@ -40,11 +40,11 @@ def test_the_same_seed_gives_the_same_weights(tiny_run, tmp_path):
 
 
 def test_training_lowers_the_score_on_val(tiny_run):
-    scores = [entry["val_score"] for entry in tiny_run.history]
+    scores = [entry.val_score for entry in tiny_run.history]
     assert min(scores) < 0.7 * scores[0]
 
 
-@pytest.mark.parametrize(("calls", "wanted"), [(1, "features"), (0, "head"), (17, "head")])
+@pytest.mark.parametrize(("calls", "wanted"), [(1, "features"), (0, "cjp"), (17, "cjp")])
 def test_an_interrupted_run_ends_as_if_it_never_was(tiny_run, tmp_path, calls, wanted):
     folder = tmp_path / "broken"
     with pytest.raises(InterruptedTrainingError):
@@ -85,7 +85,7 @@ def test_the_papers_choices_train(tmp_path, latent):
     config = tiny_config(steps=100)
     head = type(config.head)(latent_size=3, latent=latent, gate="literal", bounds="free")
     run = train(tmp_path / "run", tiny_config(steps=100, head=head), ignore_progress)
-    assert np.isfinite(run.history[-1]["loss"])
+    assert np.isfinite(run.history[-1].loss)
 
 
 def test_rotations_too_wide_for_one_tangent_are_refused():

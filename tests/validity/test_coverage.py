@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from cvo_edge.conformal import (
+    LinearScale,
     conformal_quantile,
     conformal_rank,
     hierarchical_quantile,
-    joint_scores,
 )
 
 REPEATS = 1000
@@ -32,11 +32,12 @@ def test_joint_coverage_of_correlated_scores_is_rank_over_n_plus_one(n):
     generator = np.random.default_rng(n)
     mixing = 0.3 * np.eye(6) + 0.7
     hits, trials = 0, 40
-    scales = np.array([0.5, 1.0, 2.0, 1.0, 1.0, 3.0])
+    scale = LinearScale(np.array([[0.5, 1.0, 2.0, 1.0, 1.0, 3.0]]))
     for _ in range(REPEATS):
-        scores = np.abs(generator.standard_normal((n + trials, 6)) @ mixing)
-        q_hat = conformal_quantile(joint_scores(scores[:n], scales), confidence)
-        hits += int((scores[n:] <= scales * q_hat).all(axis=1).sum())
+        scores = np.abs(generator.standard_normal((n + trials, 1, 6)) @ mixing)
+        largest = scale.comparable(scores[:n]).max(axis=(1, 2))
+        thresholds = scale.thresholds(conformal_quantile(largest, confidence))
+        hits += int((scores[n:] <= thresholds).all(axis=(1, 2)).sum())
     k = conformal_rank(n, confidence)
     # Beta(k, n + 1 - k) between calibrations, binomial within one.
     mean = k / (n + 1)

@@ -6,14 +6,31 @@ point m and bounds Q_l, Q_h of all six degrees of freedom, trained with one loss
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
 import torch
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
 from scipy.stats import norm, qmc
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from cvo_edge.heads.cjp import CjpParameters
+from cvo_export.calibrate import Candidate
+from cvo_export.heads.base import (
+    DOF,
+    ExportedHead,
+    Learner,
+    Lessons,
+    Method,
+    Setting,
+    Standardise,
+    conformalised_score,
+    dense,
+    half_width_floor,
+)
 from cvo_export.losses import (
     CombinedCalibrationLoss,
     Gate,
@@ -21,16 +38,16 @@ from cvo_export.losses import (
     interval_score_loss,
     kl_divergence,
 )
+from cvo_export.target import PoseDecoder
 
+Array = NDArray[np.float64]
 Latent = Literal["mean", "codebook", "sample"]
 Bounds = Literal["softplus", "free"]
 
-DOF = 6
 _CODEBOOK_SIZE = 16
 
 
-@dataclass(frozen=True)
-class CjpConfig:
+class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unknown_fields=True):
     """The choices of method and loss; the paper's are latent_size 3, gate literal, latent sample.
 
     Attributes
@@ -57,14 +74,14 @@ class CjpConfig:
         Dropout behind the encoder's and decoder's layers while training.
     """
 
-    latent_size: int = 16
+    latent_size: Annotated[int, Meta(ge=1, le=4096)] = 16
     latent: Latent = "mean"
     bounds: Bounds = "softplus"
     hidden: tuple[int, int] = (256, 128)
-    sharpness: float = 0.5
+    sharpness: Annotated[float, Meta(ge=0, le=1)] = 0.5
     gate: Gate = "corrected"
     interval_form: IntervalForm = "proper"
-    kl_weight: float = 1e-3
+    kl_weight: Annotated[float, Meta(ge=0)] = 1e-3
     feature_noise: float = 0.1
     dropout: float = 0.0
 
@@ -86,27 +103,21 @@ class CjpNetwork(nn.Module):
         super().__init__()
         self.config = config
         wide, narrow = config.hidden
-        self.register_buffer("feature_mean", torch.zeros(size))
-        self.register_buffer("feature_std", torch.ones(size))
-        self.feature_mean: Tensor
-        self.feature_std: Tensor
+        self.standardise = Standardise(size, config.feature_noise)
         self.encoder = nn.Sequential(
-            *_layer(size, wide, config.dropout), *_layer(wide, narrow, config.dropout)
+            *dense(size, wide, config.dropout), *dense(wide, narrow, config.dropout)
         )
         self.mu = nn.Linear(narrow, config.latent_size)
         self.log_variance = nn.Linear(narrow, config.latent_size)
         self.decoder = nn.Sequential(
-            *_layer(config.latent_size, narrow, config.dropout),
-            *_layer(narrow, wide, config.dropout),
+            *dense(config.latent_size, narrow, config.dropout),
+            *dense(narrow, wide, config.dropout),
             nn.Linear(wide, 3 * DOF),
         )
 
     def encode(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Features (n, size) -> mean and log variance of the latent, (n, latent_size) each."""
-        x = (features - self.feature_mean) / self.feature_std
-        if self.training:
-            x = x + self.config.feature_noise * torch.randn_like(x)
-        hidden = self.encoder(x)
+        hidden = self.encoder(self.standardise(features))
         # Beyond +-10 a variance is zero or infinite in float32; early steps do go there.
         return self.mu(hidden), self.log_variance(hidden).clamp(-10.0, 10.0)
 
@@ -124,16 +135,24 @@ class CjpNetwork(nn.Module):
         return CjpPrediction(*self.decode(z), mu, log_variance)
 
 
-class CjpLoss(nn.Module):
-    """Eq. 6: MSE + beta KL + INTSCORE + COMCAL, on standardised degrees of freedom."""
+class CjpLearner(Learner):
+    """The network with Eq. 6: MSE + beta KL + INTSCORE + COMCAL, on standardised numbers."""
 
-    def __init__(self, config: CjpConfig) -> None:
+    def __init__(self, size: int, config: CjpConfig) -> None:
         super().__init__()
         self.config = config
+        self.network = CjpNetwork(size, config)
+        self.standardise = self.network.standardise
         self.combined_calibration = CombinedCalibrationLoss(DOF, config.sharpness, config.gate)
 
-    def forward(self, prediction: CjpPrediction, y: Tensor, warm_up: bool = False) -> Tensor:
-        """Prediction and truth (n, 6) -> scalar; during warm-up without the calibration term."""
+    def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
+        """Features (n, size), truth (n, 6) -> scalar; in warm-up without the calibration term."""
+        noise = torch.randn(len(y), self.config.latent_size)
+        prediction = self.network(features, noise)
+        return self.of_prediction(prediction, y, warm_up)
+
+    def of_prediction(self, prediction: CjpPrediction, y: Tensor, warm_up: bool) -> Tensor:
+        """Prediction and truth (n, 6) -> scalar."""
         point, lower, upper, mu, log_variance = prediction
         loss = (
             (point - y).square().mean()
@@ -143,6 +162,11 @@ class CjpLoss(nn.Module):
         # Running coverages must see the warm-up, too: they gate what comes after it.
         combined = self.combined_calibration(lower, upper, y)
         return loss if warm_up else loss + combined
+
+    def val_score(self, features: Tensor, y: Array) -> float:
+        """As ``Learner``; of the network's own bounds with the additive score."""
+        _, lower, upper = CjpDecoded(self.network)(features)
+        return conformalised_score(lower.double().numpy(), upper.double().numpy(), y)
 
 
 class CjpDecoded(nn.Module):
@@ -171,9 +195,53 @@ class CjpDecoded(nn.Module):
         return point, lower, upper
 
 
-def _layer(inputs: int, outputs: int, dropout: float) -> list[nn.Module]:
-    layer: list[nn.Module] = [nn.Linear(inputs, outputs), nn.PReLU(outputs)]
-    return [*layer, nn.Dropout(dropout)] if dropout > 0 else layer
+class CjpHead(ExportedHead):
+    """Features -> pose (n, 7), lower and upper (n, 6); noise is an input in ``sample`` mode."""
+
+    output_names = ("pose", "lower", "upper")
+
+    def __init__(self, network: CjpNetwork, setting: Setting) -> None:
+        super().__init__()
+        self.decoded = CjpDecoded(network)
+        self.decoder = PoseDecoder(setting.target)
+        config = network.config
+        if config.latent == "sample":
+            self.extra_inputs = {"latent_noise": torch.zeros((1, config.latent_size))}
+        self._method_parameters = CjpParameters(
+            half_width_floor=half_width_floor(setting.target),
+            latent=config.latent,
+            latent_size=config.latent_size,
+            noise_seed=setting.seed,
+        )
+
+    def forward(
+        self, features: Tensor, noise: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return pose, lower and upper in metres and radians."""
+        point, lower, upper = (self.decoder(values) for values in self.decoded(features, noise))
+        return self.decoder.pose(point), lower, upper
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Normalised before additive: factors carry over to harder or easier recordings."""
+        return (
+            Candidate("normalised", self._method_parameters),
+            Candidate("additive", self._method_parameters),
+        )
+
+
+def _train(lessons: Lessons, config: CjpConfig) -> CjpHead:
+    setting = lessons.setting
+    learner = lessons.learn("cjp", lambda: CjpLearner(setting.feature_size, config))
+    return CjpHead(learner.network, setting)
+
+
+def _restore(setting: Setting, config: CjpConfig, state: Mapping[str, Tensor]) -> CjpHead:
+    head = CjpHead(CjpNetwork(setting.feature_size, config), setting)
+    head.load_state_dict(state)
+    return head
+
+
+METHOD = Method(CjpConfig, _train, _restore)
 
 
 def _codebook(latent_size: int) -> Tensor:

@@ -1,0 +1,173 @@
+"""Conformalized quantile regression (CQR): an interval of the network, corrected to be true.
+
+The model gives a point m and bounds Q_l, Q_h (here the quantiles of a forest, inside the graph);
+their own coverage is whatever it is. The nonconformity score says by how much the truth y is
+outside, and its inverse moves the bounds by the conformal quantile q. Three scores, named in
+``calibration.score``:
+
+- ``additive`` (Romano, Patterson and Candes 2019, eq. 6): Q_l - y below, y - Q_h above, so the
+  set is [Q_l - q, Q_h + q]; a negative q narrows.
+- ``normalised`` (CQR-r, Sesia and Candes 2020): (m - y)/(m - Q_l) below, (y - m)/(Q_h - m) above,
+  half-widths floored, so the set is [m - q (m - Q_l), m + q (Q_h - m)]: frames that the model
+  finds hard get the larger correction.
+- ``residual``: |y - m|, for a model that gives a point and no bounds; the set is [m - q, m + q].
+
+``sides`` says how the two sides become thresholds: ``symmetric``, their maximum, one q; or
+``asymmetric``, a q for each side at half the miscoverage (Romano et al., theorem 2); or only the
+``lower`` or ``upper`` bound, at the whole miscoverage, the other side unbounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from cvo_edge.artifact import Calibration, SixOrUnbounded, SixPositive, Threshold
+from cvo_edge.conformal import JointScale, LinearScale
+from cvo_edge.errors import CalibrationFileError
+from cvo_edge.pose import ConformalSet
+
+Array = NDArray[np.float64]
+Sides = Literal["symmetric", "asymmetric", "lower", "upper"]
+
+_POINT: dict[str, tuple[int, ...]] = {"pose": (1, 7)}
+_BOUNDED: dict[str, tuple[int, ...]] = {**_POINT, "lower": (1, 6), "upper": (1, 6)}
+
+
+@dataclass(frozen=True, eq=False)
+class IntervalScore:
+    """The score of an interval and its inverse; all arrays in metres and radians.
+
+    ``floor`` (6,) is the least half-width of the normalised score, None for the additive one.
+    """
+
+    floor: Array | None
+
+    def sides(self, lower: Array, upper: Array, point: Array, truth: Array) -> Array:
+        """Bounds, point and truth (n, 6) -> scores below and above, (n, 2, 6)."""
+        if self.floor is None:
+            return np.stack([lower - truth, truth - upper], axis=1)
+        below = (point - truth) / np.maximum(point - lower, self.floor)
+        above = (truth - point) / np.maximum(upper - point, self.floor)
+        return np.stack([below, above], axis=1)
+
+    def inverse(
+        self, lower: Array, upper: Array, point: Array, q_low: Array, q_high: Array
+    ) -> ConformalSet:
+        """One frame's bounds and point (6,), thresholds (6,) -> its set; if empty, its middle."""
+        if self.floor is None:
+            lower, upper = lower - q_low, upper + q_high
+        else:
+            lower, upper = (
+                point - q_low * np.maximum(point - lower, self.floor),
+                point + q_high * np.maximum(upper - point, self.floor),
+            )
+        crossed = lower > upper
+        if not crossed.any():
+            return ConformalSet(lower, upper)
+        middle = 0.5 * (lower + upper)
+        return ConformalSet(
+            np.where(crossed, middle, lower), np.where(crossed, middle, upper), crossed=True
+        )
+
+
+class CqrParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """``method_parameters`` of a CQR bundle.
+
+    ``half_width_floor``: least half-width per DoF (m, rad) in the normalised score. ``sides``:
+    which bounds are calibrated, and how, see above.
+    """
+
+    half_width_floor: SixPositive
+    sides: Sides
+
+
+class CqrHead:
+    """Score and set of conformalized quantile regression."""
+
+    parameters_type: ClassVar[type[Struct]] = CqrParameters
+
+    def __init__(self, calibration: Calibration) -> None:
+        parameters = calibration.parameters(CqrParameters)
+        self._prepare(
+            calibration,
+            parameters.half_width_floor,
+            parameters.sides,
+            ("additive", "normalised", "residual"),
+        )
+
+    def _prepare(
+        self, calibration: Calibration, floor: SixPositive, sides: Sides, known: tuple[str, ...]
+    ) -> None:
+        """Take one of the known scores and check the thresholds against it."""
+        score = calibration.calibration.score
+        if score not in known:
+            raise CalibrationFileError(
+                f"calibration.score: expected one of {', '.join(known)} for {calibration.method}, "
+                f"found {score!r}"
+            )
+        self._score = IntervalScore(np.array(floor) if score == "normalised" else None)
+        self._sides = sides
+        self._bounds = score != "residual"
+        self.outputs: Mapping[str, tuple[int, ...]] = _BOUNDED if self._bounds else _POINT
+        symmetric = sides == "symmetric"
+        if any((t.q_hat_upper is None) != symmetric for t in calibration.thresholds):
+            raise CalibrationFileError(
+                f"thresholds.q_hat_upper: expected {'null' if symmetric else 'six values'} with "
+                f"{sides} sides, found otherwise"
+            )
+        smallest = min(q for t in calibration.thresholds for q in (*t.q_hat, 0.0) if q is not None)
+        # The larger of two opposite scores is never negative.
+        if symmetric and score != "additive" and smallest < 0.0:
+            raise CalibrationFileError(
+                f"thresholds.q_hat: expected factors of at least 0 for the {score} score, "
+                f"found {smallest}"
+            )
+
+    def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
+        """Nothing: the image is the only input."""
+        return {}
+
+    def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
+        """The marginal confidence of each side's threshold, None where a side has none."""
+        return {
+            "symmetric": (confidence,),
+            "asymmetric": (0.5 + 0.5 * confidence,) * 2,
+            "lower": (confidence, None),
+            "upper": (None, confidence),
+        }[self._sides]
+
+    def joint_scale(self, scores: Array) -> JointScale:
+        """Scores (n, sides, 6) of other frames -> how columns are compared for the joint scope."""
+        return LinearScale.fitted(scores)
+
+    def scores(self, outputs: Mapping[str, NDArray[Any]], point: Array, truth: Array) -> Array:
+        """Outputs stacked over n frames, point and truth (n, 6) -> scores (n, sides, 6)."""
+        sides = self._score.sides(*self._interval(outputs, point), point, truth)
+        return sides.max(axis=1, keepdims=True) if self._sides == "symmetric" else sides
+
+    def region(
+        self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
+    ) -> ConformalSet:
+        """Outputs of one frame, point (6,) -> its set; where it is empty, its middle."""
+        lower, upper = self._interval(outputs, point)
+        q_low = infinite_where_null(threshold.q_hat)
+        q_high = q_low
+        if threshold.q_hat_upper is not None:
+            q_high = infinite_where_null(threshold.q_hat_upper)
+        return self._score.inverse(lower.reshape(6), upper.reshape(6), point, q_low, q_high)
+
+    def _interval(self, outputs: Mapping[str, NDArray[Any]], point: Array) -> tuple[Array, Array]:
+        if not self._bounds:
+            return point, point
+        return outputs["lower"].astype(np.float64), outputs["upper"].astype(np.float64)
+
+
+def infinite_where_null(q_hat: SixOrUnbounded) -> Array:
+    """A stored threshold -> numbers (6,), infinite where it is unbounded."""
+    return np.array([np.inf if q is None else q for q in q_hat])

@@ -1,0 +1,165 @@
+"""Conformalized set prediction (CSP): each degree of freedom as classes, its set a union of them.
+
+A degree of freedom's workspace is cut into K classes, narrow where the camera was often; the model
+gives a probability p_k for each. The set holds every class whose nonconformity score is at most the
+conformal quantile: adjacent ones merge into bands, and bands may be apart. Scores, named in
+``calibration.score``, with the probabilities sorted downwards and r_k the rank of class k from 1:
+
+- ``lac`` (Sadinle, Lei and Wasserman 2019; the paper): 1 - p_k.
+- ``aps`` (Romano, Sesia and Candes 2020, without randomisation): the mass of the classes ranked up
+  to r_k.
+- ``raps`` (Angelopoulos, Bates, Malik and Jordan 2021): ``aps`` + penalty * max(0, r_k - free).
+
+The most probable class is always in the set. A truth outside the workspace has an infinite score,
+in calibration as in use, so that coverage counts it and sets end where the workspace does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from cvo_edge.artifact import Calibration, Threshold
+from cvo_edge.conformal import JointScale, RankScale
+from cvo_edge.errors import CalibrationFileError
+from cvo_edge.heads.cqr import infinite_where_null
+from cvo_edge.pose import ConformalSet
+
+Array = NDArray[np.float64]
+Edges = Annotated[tuple[float, ...], Meta(min_length=3, max_length=513)]
+
+
+class Score(StrEnum):
+    """Nonconformity scores of classes, see above."""
+
+    LAC = "lac"
+    APS = "aps"
+    RAPS = "raps"
+
+
+class CspParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """``method_parameters`` of a CSP bundle.
+
+    ``edges``: per DoF the ascending edges of its classes (m, rad), one more than classes; a DoF
+    with fewer classes than another leaves the last probabilities unused. ``penalty`` and
+    ``free_ranks``: of the ``raps`` score.
+    """
+
+    edges: tuple[Edges, Edges, Edges, Edges, Edges, Edges]
+    penalty: Annotated[float, Meta(ge=0, le=10)]
+    free_ranks: Annotated[int, Meta(ge=0, le=512)]
+
+
+class CspHead:
+    """Score and set of conformalized set prediction."""
+
+    parameters_type: ClassVar[type[Struct]] = CspParameters
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.parameters = calibration.parameters(CspParameters)
+        try:
+            self._score = Score(calibration.calibration.score)
+        except ValueError:
+            raise CalibrationFileError(
+                f"calibration.score: expected one of {', '.join(Score)} for csp, "
+                f"found {calibration.calibration.score!r}"
+            ) from None
+        if any(t.q_hat_upper is not None for t in calibration.thresholds):
+            raise CalibrationFileError("thresholds.q_hat_upper: expected null for csp, found more")
+        edges = self.parameters.edges
+        for dof, row in enumerate(edges):
+            if any(not low < high for low, high in pairwise(row)):
+                raise CalibrationFileError(
+                    f"method_parameters.edges: expected ascending edges, found others at [{dof}]"
+                )
+        self._classes = np.array([len(row) - 1 for row in edges])
+        most = int(self._classes.max())
+        self.outputs: Mapping[str, tuple[int, ...]] = {
+            "pose": (1, 7),
+            "probabilities": (1, 6, most),
+        }
+        self._edges = np.array([(*row, *(row[-1],) * (most + 1 - len(row))) for row in edges])
+        self._unused = np.arange(most) >= self._classes[:, None]
+
+    def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
+        """Nothing: the image is the only input."""
+        return {}
+
+    def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
+        """One threshold for the whole set."""
+        return (confidence,)
+
+    def joint_scale(self, scores: Array) -> JointScale:
+        """Scores (n, 1, 6) of other frames -> how DoFs are compared for the joint scope."""
+        top = 1.0
+        if self._score is Score.RAPS:
+            ranks = int(self._classes.max()) - self.parameters.free_ranks
+            top += self.parameters.penalty * max(0, ranks)
+        return RankScale.fitted(scores, top)
+
+    def scores(self, outputs: Mapping[str, NDArray[Any]], point: Array, truth: Array) -> Array:
+        """Output ``probabilities`` (n, 6, K), point and truth (n, 6) -> scores (n, 1, 6)."""
+        classes = self._class_scores(outputs["probabilities"])
+        of_truth = np.full(truth.shape, np.inf)
+        for dof, edges in enumerate(self.parameters.edges):
+            y = truth[:, dof]
+            inside = (edges[0] <= y) & (y <= edges[-1])
+            index = np.searchsorted(edges[1:-1], y, side="right")
+            found = classes[np.arange(len(y)), dof, index]
+            of_truth[:, dof] = np.where(inside, found, np.inf)
+        return of_truth[:, np.newaxis]
+
+    def region(
+        self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
+    ) -> ConformalSet:
+        """Outputs of one frame -> its bands and their hull; point (6,) is not needed."""
+        probabilities = outputs["probabilities"]
+        q_hat = infinite_where_null(threshold.q_hat)
+        inside = self._class_scores(probabilities)[0] <= q_hat[:, np.newaxis]
+        inside &= ~self._unused
+        inside[np.arange(6), probabilities[0].argmax(axis=1)] = True
+        # Where membership changes, row by row: starts and ends take turns.
+        framed = np.zeros((6, inside.shape[1] + 2), dtype=np.int8)
+        framed[:, 1:-1] = inside
+        dof, where = np.nonzero(framed[:, 1:] != framed[:, :-1])
+        ends = self._edges[dof, where].tolist()
+        bands: list[list[tuple[float, float]]] = [[], [], [], [], [], []]
+        for row, low, high in zip(dof[::2].tolist(), ends[::2], ends[1::2], strict=True):
+            bands[row].append((low, high))
+        for row in np.flatnonzero(np.isinf(q_hat)).tolist():
+            bands[row] = [(-np.inf, np.inf)]
+        return ConformalSet(
+            np.array([row[0][0] for row in bands]),
+            np.array([row[-1][1] for row in bands]),
+            bands=(*map(tuple, bands),),
+        )
+
+    def _class_scores(self, probabilities: NDArray[Any]) -> Array:
+        parameters = self.parameters
+        return class_scores(probabilities, self._score, parameters.penalty, parameters.free_ranks)
+
+
+def class_scores(
+    probabilities: NDArray[Any], score: Score, penalty: float = 0.0, free_ranks: int = 0
+) -> Array:
+    """Probabilities (n, 6, K) -> the score that each class would have as the truth, (n, 6, K).
+
+    Calibration and sets both read it, so that a class is in the set exactly where its score is at
+    most the threshold.
+    """
+    p = probabilities.astype(np.float64)
+    if score is Score.LAC:
+        return np.asarray(1.0 - p)
+    order = np.argsort(-p, axis=-1, kind="stable")
+    ranked = np.cumsum(np.take_along_axis(p, order, axis=-1), axis=-1)
+    if score is Score.RAPS:
+        ranked += penalty * np.maximum(np.arange(1, p.shape[-1] + 1) - free_ranks, 0)
+    scores = np.empty_like(p)
+    np.put_along_axis(scores, order, ranked, axis=-1)
+    return scores

@@ -1,0 +1,152 @@
+"""A bundle folder, written whole or not at all; and what every draft of one has in common."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge import artifact, geometry
+from cvo_edge.artifact import Calibration
+from cvo_edge.errors import SinkError
+from cvo_edge.odometer import Odometer
+from cvo_edge.pose import Chart
+from cvo_edge.selftest import check_selftest
+from cvo_edge.session import Session
+
+Array = NDArray[np.float64]
+
+WORLD_FRAME, CAMERA_FRAME = "world", "camera"
+
+# Beyond this spread about the mean rotation the tangent at it comes near its cut at pi.
+MAX_SPREAD_RAD = 2.0
+# Least half-width in the normalised score, in standard deviations of each DoF.
+HALF_WIDTH_FLOOR = 0.01
+_LEAST_DEVIATION = 1e-6
+
+# How far beyond the known poses a pose is still plausible, in ranges of each DoF.
+_LIMIT_MARGIN = 0.5
+_SELFTEST_TOLERANCE = 1e-3
+# Of another shape than any camera and model, so that resize and crop are tested, too.
+_SELFTEST_SIZE = (418, 650)
+
+
+def check_target(bundle_dir: Path) -> None:
+    """Raise SinkError where the folder holds something that is no bundle."""
+    own = {artifact.CALIBRATION_FILE, artifact.MODEL_FILE}
+    if bundle_dir.exists() and not (
+        bundle_dir.is_dir() and {path.name for path in bundle_dir.iterdir()} == own
+    ):
+        raise SinkError(
+            f"{bundle_dir}: expected a new folder or a bundle to replace, found another"
+        )
+
+
+def write_bundle(bundle_dir: Path, calibration: Calibration, model_bytes: bytes) -> Calibration:
+    """Write beside the target, verify by reading and self-test, then move into place.
+
+    Raises
+    ------
+    GateError
+        The written bundle fails its own self-test.
+    SinkError
+        The folder cannot be written.
+    """
+    content = artifact.encode_calibration(calibration)
+    parent = bundle_dir.resolve().parent
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{bundle_dir.name}.", dir=parent))
+    except OSError as error:
+        raise SinkError(f"{parent}: cannot be written: {error.strerror}") from None
+    try:
+        partial.chmod(0o755)
+        (partial / artifact.MODEL_FILE).write_bytes(model_bytes)
+        (partial / artifact.CALIBRATION_FILE).write_bytes(content)
+        with Odometer.load(partial) as odometer:
+            check_selftest(odometer)
+        replaced = None
+        if bundle_dir.exists():
+            replaced = Path(tempfile.mkdtemp(prefix=f".{bundle_dir.name}.", dir=parent)) / "old"
+            bundle_dir.rename(replaced)
+        partial.rename(bundle_dir)
+        if replaced is not None:
+            shutil.rmtree(replaced.parent)
+    except OSError as error:
+        raise SinkError(f"{bundle_dir}: cannot be written: {error.strerror}") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return artifact.read_calibration(bundle_dir)
+
+
+def model_spec(model_bytes: bytes, opset: int) -> artifact.ModelSpec:
+    """What the calibration says of a float32 model."""
+    session = Session(model_bytes)
+    return artifact.ModelSpec(
+        file=artifact.MODEL_FILE,
+        sha256=hashlib.sha256(model_bytes).hexdigest(),
+        opset=opset,
+        precision="fp32",
+        inputs=session.inputs,
+        outputs=session.outputs,
+    )
+
+
+def known_coordinates(poses: Array, reference_q_xyzw: Array) -> Array:
+    """Poses (n, 7) -> position and tangent at a reference rotation, (n, 6), m and rad."""
+    return Chart("tangent_reference", reference_q_xyzw).coordinates(poses, poses)
+
+
+def known_space(
+    poses: Array,
+) -> tuple[artifact.Quaternion | None, artifact.PoseLimits, artifact.SixPositive]:
+    """Mean rotation, plausible limits in the tangent there, and deviation, of known poses (n, 7).
+
+    The rotation is None where they spread too far for one tangent.
+    """
+    reference = geometry.mean_rotation(poses[:, 3:])
+    coordinates = known_coordinates(poses, reference)
+    spread = float(np.linalg.norm(coordinates[:, 3:], axis=1).max())
+    return (
+        four(reference) if spread <= MAX_SPREAD_RAD else None,
+        plausible(coordinates),
+        six(np.maximum(coordinates.std(axis=0), _LEAST_DEVIATION)),
+    )
+
+
+def plausible(coordinates: Array) -> artifact.PoseLimits:
+    """Limits around known poses (n, 6), half of their range wider on each side."""
+    lowest, highest = coordinates.min(axis=0), coordinates.max(axis=0)
+    margin = np.maximum(_LIMIT_MARGIN * (highest - lowest), _LEAST_DEVIATION)
+    return artifact.PoseLimits(lowest=six(lowest - margin), highest=six(highest + margin))
+
+
+def blank_selftest() -> artifact.SelfTest:
+    """Return the self-test without the outputs that the model must give."""
+    height, width = _SELFTEST_SIZE
+    return artifact.SelfTest(
+        recipe="ripples-1", height=height, width=width, outputs={}, tolerance=_SELFTEST_TOLERANCE
+    )
+
+
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Version of each installed package, for the provenance."""
+    return {package: importlib.metadata.version(package) for package in packages}
+
+
+def four(values: Array) -> artifact.Quaternion:
+    """Shape (4,) -> a quaternion."""
+    x, y, z, w = (float(value) for value in values)
+    return (x, y, z, w)
+
+
+def six(values: Array) -> artifact.Six:
+    """Shape (6,) -> six numbers."""
+    a, b, c, d, e, f = (float(value) for value in values)
+    return (a, b, c, d, e, f)

@@ -1,0 +1,264 @@
+"""A network that is already there -> a bundle: any ONNX model of the right form, or a bundle.
+
+Needs no torch. A model with the output ``pose`` alone gets the residual score; one with ``lower``
+and ``upper`` besides the scores of conformalized quantile regression. A bundle keeps its method and
+gets thresholds of other data: a new site, another camera, another light.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import onnx
+from google.protobuf.message import DecodeError
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from cvo_edge import artifact
+from cvo_edge.artifact import Calibration, PoseLimits, read_bundle
+from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageError
+from cvo_edge.geometry import mean_rotation
+from cvo_edge.heads import HEADS
+from cvo_edge.heads.cqr import CqrParameters, Sides
+from cvo_edge.preprocess import Crop
+from cvo_export.bundle import (
+    CAMERA_FRAME,
+    HALF_WIDTH_FLOOR,
+    WORLD_FRAME,
+    blank_selftest,
+    check_target,
+    known_coordinates,
+    known_space,
+    model_spec,
+    plausible,
+    six,
+    versions,
+    write_bundle,
+)
+from cvo_export.calibrate import Candidate, Joint, Rule, calibrated, selected
+from cvo_export.datasets import PoseDataset
+from cvo_export.splits import Kind, Split, default_kind, make_split, same_split
+
+Array = NDArray[np.float64]
+GivenRotation = Literal["tangent_predicted", "euler_zyx"]
+
+_FORMS = ({"pose": (1, 7)}, {"pose": (1, 7), "lower": (1, 6), "upper": (1, 6)})
+_FULL_TURN = float(np.pi)
+
+
+def recalibrate(
+    model: Path,
+    dataset: PoseDataset,
+    bundle_dir: Path,
+    name: str,
+    *,
+    kind: Kind | None = None,
+    seed: int = 0,
+    rule: Rule | None = None,
+    joint: Joint = "max",
+    score: str | None = None,
+    sides: Sides | None = None,
+    rotation: GivenRotation = "tangent_predicted",
+    crop: Crop = "none",
+) -> Calibration:
+    """Calibrate a model file or the model of a bundle on a data set and write the new bundle.
+
+    The data set is one that the network has not been trained on: a tenth of it (role ``val``)
+    decides between scores and compares degrees of freedom, a fifth (``test``) is left for
+    ``evaluate``, the rest gives the thresholds. Where it is the very data set that the bundle's run
+    was split from, that run's own ``val`` and ``cal`` are used. ``rotation`` and ``crop`` describe
+    a model file.
+
+    Raises
+    ------
+    ModelError, BundleMismatchError
+        The file is no model, or has other inputs and outputs.
+    CalibrationFileError
+        The folder is no bundle.
+    SourceError, UsageError
+        The data set is too small or its frames do not pass the checks.
+    SinkError
+        The new folder cannot be written.
+    """
+    check_target(bundle_dir)
+    if model.is_dir():
+        bundle = read_bundle(model)
+        split = _split_of(bundle.calibration, dataset, kind, seed)
+        draft = _with_wider_limits(bundle.calibration, dataset.poses[_known(split)])
+        model_bytes = bundle.model_bytes
+        candidates = _own_candidates(bundle.calibration)
+    else:
+        model_bytes = _read_model(model)
+        split = _new_split(dataset, kind, seed)
+        draft = _from_model(model_bytes, dataset, split, name, rotation, crop)
+        candidates = _given_candidates(draft)
+    if rule is None:
+        rule = "hierarchical" if split.kind == "sequence" else "pooled"
+    source = replace(
+        draft.calibration, rule=rule, joint=joint, split=split.spec(dataset), dataset=dataset.name
+    )
+    draft = replace(draft, name=name, calibration=source)
+    chosen_from = selected(candidates, score, sides)
+    calibration = calibrated(draft, model_bytes, dataset, split.roles, chosen_from)
+    return write_bundle(bundle_dir, calibration, model_bytes)
+
+
+def _split_of(
+    calibration: Calibration, dataset: PoseDataset, kind: Kind | None, seed: int
+) -> Split:
+    """The run's own split where the data set is the run's, else one of frames new to it."""
+    try:
+        return same_split(dataset, calibration.calibration.split)
+    except (SourceError, UsageError):
+        return _new_split(dataset, kind, seed)
+
+
+def _new_split(dataset: PoseDataset, kind: Kind | None, seed: int) -> Split:
+    return make_split(dataset, kind or default_kind(dataset, "calibration"), seed, "calibration")
+
+
+def _known(split: Split) -> NDArray[np.int64]:
+    """Frames whose poses may be looked at: all but test."""
+    return np.concatenate([split.roles["val"], split.roles["cal"]])
+
+
+def _read_model(path: Path) -> bytes:
+    if not path.is_file():
+        raise ModelError(f"{path}: expected an ONNX file or a bundle folder, found none")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _opset(model_bytes: bytes) -> int:
+    try:
+        model = onnx.load_from_string(model_bytes)
+    except DecodeError:
+        raise ModelError("model: expected an ONNX file, found something else") from None
+    versions = [entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")]
+    return int(max(versions, default=1))
+
+
+def _from_model(
+    model_bytes: bytes,
+    dataset: PoseDataset,
+    split: Split,
+    name: str,
+    rotation: GivenRotation,
+    crop: Crop,
+) -> Calibration:
+    """Draft for a model that nothing is known of but its tensors and the data's poses."""
+    spec = model_spec(model_bytes, _opset(model_bytes))
+    outputs = {tensor.name: tensor.shape for tensor in spec.outputs}
+    shape = spec.inputs[0].shape if len(spec.inputs) == 1 else ()
+    image = {"name": "image", "dtype": "uint8", "shape": (1, *shape[1:3], 3)}
+    if outputs not in _FORMS or [_fields(tensor) for tensor in spec.inputs] != [image]:
+        raise BundleMismatchError(
+            "model: expected the input image uint8 [1, height, width, 3] and the outputs pose "
+            "[1, 7] or pose, lower, upper [1, 6], found "
+            + ", ".join(
+                f"{t.name} {t.dtype} {list(t.shape)}" for t in (*spec.inputs, *spec.outputs)
+            )
+        )
+    reference, limits, deviation = known_space(dataset.poses[_known(split)])
+    if rotation == "euler_zyx" or reference is None:
+        reference, limits = None, _with_any_rotation(limits)
+    return Calibration(
+        schema_version=1,
+        name=name,
+        method="cqr",
+        model=spec,
+        preprocess=artifact.PreprocessSpec(
+            height=shape[1],
+            width=shape[2],
+            colour_order="rgb",
+            interpolation="halve_then_linear_exact",
+            crop=crop,
+            mean=None,
+            std=None,
+            layout="nhwc",
+            in_graph=("cast", "transpose", "normalise"),
+        ),
+        pose=artifact.PoseSpec(
+            target="absolute",
+            frame_id=WORLD_FRAME,
+            child_frame_id=CAMERA_FRAME,
+            rotation=rotation,
+            reference_q_xyzw=reference,
+            units=("m", "rad"),
+            limits=limits,
+            standard_deviation=deviation,
+        ),
+        thresholds=(),
+        method_parameters={},
+        calibration=artifact.CalibrationSpec(
+            score="",
+            joint="max",
+            rule="pooled",
+            n=1,
+            n_sequences=1,
+            n_effective=1.0,
+            split=split.spec(dataset),
+            dataset=dataset.name,
+        ),
+        selftest=blank_selftest(),
+        provenance=artifact.Provenance(
+            created_with=versions(("cvo-edge", "cvo-export", "onnx", "onnxruntime", "numpy")),
+            seed=split.seed,
+            backbone=None,
+            weights_sha256=None,
+            dataset=dataset.name,
+            options={},
+        ),
+        digest="0" * 64,
+    )
+
+
+def _shown(tensor: artifact.TensorSpec) -> str:
+    return f"{tensor.name} {tensor.dtype} {list(tensor.shape)}"
+
+
+def _fields(tensor: artifact.TensorSpec) -> dict[str, object]:
+    return {"name": tensor.name, "dtype": tensor.dtype, "shape": tensor.shape}
+
+
+def _with_any_rotation(limits: PoseLimits) -> PoseLimits:
+    """Keep the limits of the position; any rotation is plausible."""
+    return PoseLimits(
+        lowest=(*limits.lowest[:3], *(-_FULL_TURN,) * 3),
+        highest=(*limits.highest[:3], *(_FULL_TURN,) * 3),
+    )
+
+
+def _with_wider_limits(calibration: Calibration, poses: Array) -> Calibration:
+    """Let a bundle's limits hold the poses (n, 7) of the new data, too."""
+    pose = calibration.pose
+    if pose.reference_q_xyzw is None:
+        found = _with_any_rotation(plausible(known_coordinates(poses, mean_rotation(poses[:, 3:]))))
+    else:
+        found = plausible(known_coordinates(poses, np.array(pose.reference_q_xyzw)))
+    limits = PoseLimits(
+        lowest=six(np.minimum(pose.limits.lowest, found.lowest)),
+        highest=six(np.maximum(pose.limits.highest, found.highest)),
+    )
+    return replace(calibration, pose=replace(pose, limits=limits))
+
+
+def _given_candidates(draft: Calibration) -> tuple[Candidate, ...]:
+    floor = six(HALF_WIDTH_FLOOR * np.array(draft.pose.standard_deviation))
+    parameters = CqrParameters(half_width_floor=floor, sides="symmetric")
+    scores = ("residual",) if len(draft.model.outputs) == 1 else ("normalised", "additive")
+    return tuple(Candidate(score, parameters) for score in scores)
+
+
+def _own_candidates(calibration: Calibration) -> tuple[Candidate, ...]:
+    """A bundle's own score first, then what else its method could use with these parameters."""
+    head = HEADS[calibration.method]
+    parameters = calibration.parameters(head.parameters_type)
+    own = calibration.calibration.score
+    families = (("normalised", "additive"), ("aps", "lac"))
+    others = next((family for family in families if own in family), ())
+    return tuple(Candidate(score, parameters) for score in dict.fromkeys((own, *others)))
