@@ -140,6 +140,14 @@ class CspHead:
             bands=(*map(tuple, bands),),
         )
 
+    def classes_in(self, region: ConformalSet) -> NDArray[np.int64]:
+        """Return how many classes of each DoF a set of this head holds, (6,); all if unbounded."""
+        counts = []
+        for edges, row in zip(self.parameters.edges, region.bands or (), strict=True):
+            ends = np.searchsorted(edges, np.clip(np.array(row), edges[0], edges[-1]))
+            counts.append(int((ends[:, 1] - ends[:, 0]).sum()))
+        return np.array(counts)
+
     def _class_scores(self, probabilities: NDArray[Any]) -> Array:
         parameters = self.parameters
         return class_scores(probabilities, self._score, parameters.penalty, parameters.free_ranks)

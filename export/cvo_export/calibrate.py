@@ -203,11 +203,9 @@ def chosen(draft: Calibration, val: Observed, candidates: Sequence[Candidate]) -
         head = HEADS[calibration.method](calibration)
         scores = head.scores(val.outputs, val.point, val.truth)
         entry = _threshold(0.9, "marginal", marginal_thresholds(head, scores, 0.9, _pooled))
-        limits = calibration.pose.limits
-        lowest, highest = np.array(limits.lowest), np.array(limits.highest)
         regions = [
             head.region({k: v[row : row + 1] for k, v in val.outputs.items()}, point, entry).within(
-                lowest, highest
+                *workspace(calibration)
             )
             for row, point in enumerate(val.point)
         ]
@@ -217,6 +215,16 @@ def chosen(draft: Calibration, val: Observed, candidates: Sequence[Candidate]) -
         results.append(float((interval_score(width, distance, 0.1) / deviation).mean()))
     best = int(np.argmin(results))
     return candidates[best if results[best] < (1.0 - _CLEARLY) * results[0] else 0]
+
+
+def workspace(calibration: Calibration) -> tuple[Array, Array]:
+    """Lowest and highest value per DoF, (6,) each, that stand in for an unbounded side."""
+    limits = calibration.pose.limits
+    lowest, highest = np.array(limits.lowest), np.array(limits.highest)
+    if calibration.pose.rotation == "tangent_predicted":
+        # Offsets about the prediction: at most a half turn.
+        lowest[3:], highest[3:] = -np.pi, np.pi
+    return lowest, highest
 
 
 def thresholds(

@@ -247,7 +247,8 @@ def train(
         LabelsName | None, typer.Option(help="csp: ordinal by default; one_hot: the paper's.")
     ] = None,
     label_sigma: Annotated[
-        float | None, typer.Option(min=0.01, help="csp: deviation of ordinal labels, in classes.")
+        float | None,
+        typer.Option(min=0.01, help="csp: deviation of the labels in classes; val chooses."),
     ] = None,
 ) -> None:
     """Train a method on a data set; interrupted, the same command goes on.

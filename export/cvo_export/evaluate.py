@@ -15,8 +15,10 @@ from cvo_edge import geometry
 from cvo_edge.artifact import Calibration, Threshold, read_bundle
 from cvo_edge.conformal import conformal_rank, interval_score
 from cvo_edge.errors import GateError
+from cvo_edge.heads.csp import CspHead
 from cvo_edge.odometer import Odometer
-from cvo_export.calibrate import Observed, Rule, effective_frames, observe, thresholds
+from cvo_edge.pose import ConformalSet
+from cvo_export.calibrate import Observed, Rule, effective_frames, observe, thresholds, workspace
 from cvo_export.datasets import PoseDataset
 from cvo_export.splits import Split, same_split
 
@@ -179,6 +181,14 @@ def _level_lines(rule: str, levels: list[dict[str, Any]]) -> list[str]:
             f"{level['joint_coverage']:>7.3f}{shown:>16}{100 * width[:3].mean():>10.2f}"
             f"{np.rad2deg(width[3:].mean()):>7.2f}{level['normalised_interval_score']:>8.3f}"
         )
+    lines += [
+        f"{level['confidence']:<8g}{level['scope']:<12}"
+        f"classes in a set {np.mean(level['set_size']):.1f}, in pieces "
+        f"{100 * np.mean(level['disjoint_share']):.1f} % of sets, "
+        f"{100 * level['disjoint_frames']:.0f} % of frames"
+        for level in levels
+        if level["confidence"] == 0.9 and "set_size" in level
+    ]
     if not all(level["coverage_band_exact"] for level in levels):
         lines.append("? indicative: frames of one recording are no independent draws")
     return lines
@@ -209,24 +219,30 @@ class _Sets:
     def calibration(self) -> Calibration:
         return self.odometer.calibration
 
-    def inside(self, entry: Threshold) -> tuple[NDArray[np.bool_], Array, Array, NDArray[np.bool_]]:
-        """Covered (n, 6), width (n, 6), distance (n, 6) and boundedness (n,) of every frame."""
-        limits = self.calibration.pose.limits
-        lowest, highest = np.array(limits.lowest), np.array(limits.highest)
-        covered, width, distance, bounded = [], [], [], []
-        for row, truth in enumerate(self.seen.truth):
-            outputs = {name: values[row : row + 1] for name, values in self.seen.outputs.items()}
-            region = self.odometer.head.region(outputs, self.seen.point[row], entry)
-            bounded.append(np.isfinite(region.lower).all() and np.isfinite(region.upper).all())
-            covered.append(region.covers(truth))
-            limited = region.within(lowest, highest)
-            width.append(limited.width())
-            distance.append(limited.distance(truth))
-        return np.array(covered), np.array(width), np.array(distance), np.array(bounded)
+    def regions(self, entry: Threshold) -> list[ConformalSet]:
+        """Return the set of every frame."""
+        return [
+            self.odometer.head.region(
+                {name: values[row : row + 1] for name, values in self.seen.outputs.items()},
+                point,
+                entry,
+            )
+            for row, point in enumerate(self.seen.point)
+        ]
+
+    def covered(self, regions: list[ConformalSet]) -> NDArray[np.bool_]:
+        """Which true numbers lie in these sets, (n, 6)."""
+        return np.array([r.covers(y) for r, y in zip(regions, self.seen.truth, strict=True)])
 
     def level(self, entry: Threshold) -> dict[str, Any]:
         """Return the report's entry for one threshold."""
-        covered, width, distance, bounded = self.inside(entry)
+        regions = self.regions(entry)
+        covered = self.covered(regions)
+        bounded = np.array([np.isfinite((r.lower, r.upper)).all() for r in regions])
+        limits = workspace(self.calibration)
+        limited = [region.within(*limits) for region in regions]
+        width = np.array([region.width() for region in limited])
+        distance = np.array([r.distance(y) for r, y in zip(limited, self.seen.truth, strict=True)])
         n, n_test = self.calibration.calibration.n, len(covered)
         score = interval_score(width, distance, 1.0 - entry.confidence)
         deviation = np.array(self.calibration.pose.standard_deviation)
@@ -234,8 +250,14 @@ class _Sets:
             self.seen.outputs, self.seen.point, self.seen.truth
         )
         effective_test = effective_frames(nonconformity, self.seen.sequence)
-        # The band counts frames: it says nothing of a rule that counts sequences.
-        finite = self.rule == "pooled" and all(q is not None for q in entry.q_hat)
+        # The band is that of one order statistic of frames: it says nothing of a rule that counts
+        # sequences, of two thresholds a set, or of six that hold together by Bonferroni.
+        finite = (
+            self.rule == "pooled"
+            and entry.q_hat_upper is None
+            and all(q is not None for q in entry.q_hat)
+            and (entry.scope, self.calibration.calibration.joint) != ("joint", "bonferroni")
+        )
         return {
             "confidence": entry.confidence,
             "scope": entry.scope,
@@ -256,6 +278,19 @@ class _Sets:
             "interval_score": score.mean(axis=0).tolist(),
             "normalised_interval_score": float((score.mean(axis=0) / deviation).mean()),
             "unbounded_share": float(1.0 - bounded.mean()),
+            **self.pieces(regions),
+        }
+
+    def pieces(self, regions: list[ConformalSet]) -> dict[str, Any]:
+        """For sets of classes: how many of them (6,), and how often there is a gap (6,), at all."""
+        if not isinstance(self.odometer.head, CspHead):
+            return {}
+        gaps = np.array([[len(row) > 1 for row in region.bands or ()] for region in regions])
+        classes = np.array([self.odometer.head.classes_in(region) for region in regions])
+        return {
+            "set_size": classes.mean(axis=0).tolist(),
+            "disjoint_share": gaps.mean(axis=0).tolist(),
+            "disjoint_frames": float(gaps.any(axis=1).mean()),
         }
 
     def sequences(self, dataset: PoseDataset) -> dict[str, dict[str, Any]]:
@@ -264,8 +299,8 @@ class _Sets:
         joint = self.calibration.threshold(0.9, "joint")
         if marginal is None or joint is None:
             return {}
-        covered = self.inside(marginal)[0]
-        jointly = np.asarray(self.inside(joint)[0].all(axis=1))
+        covered = self.covered(self.regions(marginal))
+        jointly = np.asarray(self.covered(self.regions(joint)).all(axis=1))
         found = {}
         for number in np.unique(self.seen.sequence).tolist():
             rows = np.flatnonzero(np.equal(self.seen.sequence, number))

@@ -62,8 +62,8 @@ class TrainConfig:
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     weights: str = "timm"
     augment: AugmentConfig = field(default_factory=AugmentConfig)
-    copies: int = 12
-    steps: int = 6000
+    copies: int = 48
+    steps: int = 10_000
     warm_up_steps: int = 200
     batch_size: int = 64
     learning_rate: float = 1e-3

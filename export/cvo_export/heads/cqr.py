@@ -87,7 +87,7 @@ class CqrConfig(Struct, frozen=True, tag="cqr", tag_field="method", forbid_unkno
     components: Annotated[int, Meta(ge=0, le=4096)] = 58
     forest: Literal["shared", "per_dof"] = "shared"
     residuals: Literal["auto", "cross_fitted", "held_out"] = "auto"
-    forest_copies: Annotated[int, Meta(ge=0)] = 0
+    forest_copies: Annotated[int, Meta(ge=0)] = 3
     hidden: tuple[int, int] = (256, 128)
     feature_noise: float = 0.1
 

@@ -6,6 +6,7 @@ narrow where the camera was often; a shared trunk gives the logits of all six de
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
@@ -36,10 +37,13 @@ Array = NDArray[np.float64]
 
 # The workspace ends this far beyond the training poses, in ranges of each DoF.
 _MARGIN = 0.1
-_TEMPERATURES = np.exp(np.linspace(np.log(0.25), np.log(4.0), 49))
+_TEMPERATURES = np.exp(np.linspace(np.log(0.1), np.log(10.0), 97))
 # Values of Angelopoulos et al. 2021, appendix: which is best depends on the network.
 _PENALTIES = (0.001, 0.01, 0.1, 0.2, 0.5)
 _FREE_RANKS = 5
+# Narrow labels where classes are as wide as the errors, wide ones on new recordings. The middle one
+# where only one network can be trained.
+_SIGMAS = (1.5, 4.0, 10.0)
 
 
 class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unknown_fields=True):
@@ -52,7 +56,7 @@ class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unkno
     labels
         ``ordinal``: a Gaussian over the classes about the truth; ``one_hot``.
     label_sigma
-        Standard deviation of that Gaussian, in classes.
+        Standard deviation of that Gaussian, in classes; None lets val choose among 1.5, 4 and 10.
     hidden
         Widths of the trunk's two layers.
     feature_noise
@@ -61,9 +65,9 @@ class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unkno
         Dropout behind the trunk's layers while training.
     """
 
-    classes: Annotated[int, Meta(ge=2, le=512)] = 64
+    classes: Annotated[int, Meta(ge=2, le=512)] = 128
     labels: Literal["ordinal", "one_hot"] = "ordinal"
-    label_sigma: Annotated[float, Meta(gt=0)] = 1.0
+    label_sigma: Annotated[float, Meta(gt=0)] | None = None
     hidden: tuple[int, int] = (256, 128)
     feature_noise: float = 0.1
     dropout: float = 0.0
@@ -153,19 +157,20 @@ class CspNetwork(nn.Module):
 class CspLearner(Learner):
     """The network with the cross-entropy against soft or one-hot labels."""
 
-    def __init__(self, size: int, config: CspConfig, classes: Classes) -> None:
+    def __init__(self, size: int, config: CspConfig, classes: Classes, sigma: float) -> None:
         super().__init__()
-        self.config = config
+        self.one_hot = config.labels == "one_hot"
+        self.sigma = sigma
         self.network = CspNetwork(size, config, classes)
         self.standardise = self.network.standardise
 
     def labels(self, y: Tensor) -> Tensor:
         """Standardised truth (n, 6) -> what the softmax should be, (n, 6, K)."""
         classes = self.network.classes
-        if self.config.labels == "one_hot":
+        if self.one_hot:
             return one_hot(classes.index(y), classes.count).float()
         distance = torch.arange(classes.count) - classes.position(y)[..., None]
-        weight = torch.exp(-0.5 * (distance / self.config.label_sigma) ** 2) * classes.used
+        weight = torch.exp(-0.5 * (distance / self.sigma) ** 2) * classes.used
         return weight / weight.sum(dim=-1, keepdim=True)
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
@@ -243,14 +248,26 @@ class CspHead(ExportedHead):
 
 def _train(lessons: Lessons, config: CspConfig) -> CspHead:
     setting = lessons.setting
-    poses = lessons.poses()
-    classes = Classes.cut(setting.target.standardised(poses), config.classes)
-    learner = lessons.learn("csp", lambda: CspLearner(setting.feature_size, config, classes))
+    classes = Classes.cut(setting.target.standardised(lessons.poses()), config.classes)
+    sigmas: tuple[float, ...] = _SIGMAS
+    if config.label_sigma is not None:
+        sigmas = (config.label_sigma,)
+    elif lessons.fine_tuned or config.labels == "one_hot":
+        sigmas = _SIGMAS[1:2]
+
+    def learn(sigma: float) -> CspLearner:
+        size = setting.feature_size
+        return lessons.learn(
+            f"csp-sigma{sigma:g}", lambda: CspLearner(size, config, copy.deepcopy(classes), sigma)
+        )
+
+    learners = [learn(sigma) for sigma in sigmas]
     features, y = lessons.val()
     with torch.no_grad():
-        logits = learner.network(features).double()
+        network = min(learners, key=lambda learner: learner.val_score(features, y)).network
+        logits = network(features).double()
     temperature = best_temperatures(logits, classes.index(torch.from_numpy(y)))
-    return CspHead(learner.network, temperature, setting)
+    return CspHead(network, temperature, setting)
 
 
 def best_temperatures(logits: Tensor, index: Tensor) -> Tensor:

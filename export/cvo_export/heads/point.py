@@ -29,7 +29,7 @@ class PointNetwork(nn.Module):
 
 
 class PointLearner(Learner):
-    """The point network with the mean squared error."""
+    """The point network with the mean absolute error: the centre of an interval is a median."""
 
     def __init__(self, size: int, hidden: tuple[int, int], feature_noise: float) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ class PointLearner(Learner):
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
         """Features (n, size), truth (n, 6) -> scalar."""
         error: Tensor = self.network(features) - y
-        return error.square().mean()
+        return error.abs().mean()
 
     def val_score(self, features: Tensor, y: Array) -> float:
         """As ``Learner``; of intervals of one width about the point."""
