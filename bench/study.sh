@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# The figures of the README: three seeds of each recording, from training to evaluation.
-# Usage: CVO_DATA=... CVO_WEIGHTS=... bench/study.sh WORK_FOLDER [redkitchen|kitchen_flights] [SEED ...]
-# Writes bench/results/<recording>-<seed>.json and .txt; interrupted, it goes on.
+# The figures of the README: from training to evaluation.
+# Usage: CVO_DATA=... CVO_WEIGHTS=... bench/study.sh WORK_FOLDER METHOD redkitchen|kitchen_flights [SEED ...]
+# Writes bench/results/<method>-<recording>-<seed>.json and .txt; interrupted, it goes on.
 set -euo pipefail
-work=$1 recording=$2
-shift 2
+work=$1 method=$2 recording=$3
+shift 3
 results=$(cd "$(dirname "$0")" && pwd)/results
 weights=$CVO_WEIGHTS/mobilenetv2_100_imagenet.safetensors
 dataset=7scenes:$CVO_DATA/$recording
@@ -13,12 +13,13 @@ split=random
 mkdir -p "$work"
 [ $# -gt 0 ] || set -- 0 1 2
 for seed in "$@"; do
-  run=$work/$recording-$seed
+  name=$method-$recording-$seed
   start=$(date +%s)
-  cvo-export train cjp "$dataset" "$run" --split "$split" --seed "$seed" --weights "$weights"
-  cvo-export publish "$run" "$run-bundle" --rule pooled > /dev/null
+  cvo-export train "$method" "$dataset" "$work/$name" --split "$split" --seed "$seed" --weights "$weights" --cache "$work/features"
   trained=$(date +%s)
-  cvo-export evaluate "$run-bundle" "$dataset" --json "$results/$recording-$seed.json" > "$results/$recording-$seed.txt"
-  echo "train and publish $((trained - start)) s, evaluate $(($(date +%s) - trained)) s" >> "$results/$recording-$seed.txt"
-  cat "$results/$recording-$seed.txt"
+  cvo-export publish "$work/$name" "$work/$name-bundle" --rule pooled > /dev/null
+  published=$(date +%s)
+  cvo-export evaluate "$work/$name-bundle" "$dataset" --json "$results/$name.json" > "$results/$name.txt"
+  echo "train $((trained - start)) s, publish $((published - trained)) s, evaluate $(($(date +%s) - published)) s" >> "$results/$name.txt"
+  cat "$results/$name.txt"
 done
