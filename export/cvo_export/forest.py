@@ -113,7 +113,12 @@ def grow(
         x, y = x[kept], y[kept]
     grown = RandomForestRegressor(
         trees, min_samples_leaf=leaf_size, max_features=share, random_state=seed, n_jobs=-1
-    ).fit(x, y / scale)
+    ).fit(x, (y / scale).squeeze())
+    return forest_of(grown, x, y)
+
+
+def forest_of(grown: RandomForestRegressor, x: NDArray[np.float32], y: Array) -> Forest:
+    """Take the trees of a fitted forest, and hang rows (rows, features) and labels into them."""
     parts: dict[str, list[NDArray[np.generic]]] = {name: [] for name in ("f", "t", "l", "r")}
     roots, leaves, start = [], [], 0
     for estimator in grown.estimators_:
