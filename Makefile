@@ -24,7 +24,7 @@ $(DEMO_VENV)/.installed: pyproject.toml
 $(VENV)/.installed: pyproject.toml export/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet $(TORCH_PIP_OPTIONS) torch torchvision
-	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable ./export
+	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable "./export[plot]"
 	@touch $@
 
 demo: $(DEMO_VENV)/.installed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import msgspec
@@ -37,6 +38,24 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         for side, values in sides:
             cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>11}" for v in values)
             lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<16}" + cells)
+    return lines + _unbounded(calibration)
+
+
+def _unbounded(calibration: Calibration) -> list[str]:
+    """Say how many frames or sequences the unbounded thresholds would need."""
+    source = calibration.calibration
+    unit, given = ("frames", source.n)
+    if source.rule == "hierarchical":
+        unit, given = ("sequences", source.n_sequences)
+    lines = []
+    for confidence in calibration.confidences("marginal"):
+        entry = calibration.threshold(confidence, "marginal")
+        needed = math.ceil(confidence / (1.0 - confidence) - 1e-9)
+        if entry is not None and None in entry.q_hat and given < needed:
+            lines.append(
+                f"unbounded    at {confidence:g}: needs at least {needed} calibration {unit}, "
+                f"has {given}"
+            )
     return lines
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from cvo_edge.cli import guarded, write_text
+from cvo_edge.cli import ScopeName, guarded, write_text
 from cvo_edge.errors import UsageError
 from cvo_export.progress import show_progress
 
@@ -422,6 +422,36 @@ def evaluate(
         print(*table(report), sep="\n")
     if min_coverage is not None:
         check_coverage(report, min_coverage)
+
+
+@app.command()
+def plot(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
+    dataset: DatasetArgument,
+    out: Annotated[Path, typer.Option(help="Picture to write, e.g. bands.png.")],
+    subset: Annotated[
+        SubsetName, typer.Option(help="The run's test frames, or all of unseen data.")
+    ] = SubsetName.TEST,
+    sequence: Annotated[str | None, typer.Option(help="Only this sequence.")] = None,
+    confidence: Annotated[float, typer.Option(help="One of those stored in the bundle.")] = 0.9,
+    scope: Annotated[
+        ScopeName, typer.Option(help="Each degree of freedom, or all six at once.")
+    ] = ScopeName.MARGINAL,
+) -> None:
+    """Draw truth, point and bands of each degree of freedom, and x against y."""
+    from cvo_export.datasets import open_dataset
+    from cvo_export.plot import plot as draw
+
+    draw(
+        bundle,
+        open_dataset(dataset),
+        out,
+        subset=subset.value,
+        sequence=sequence,
+        confidence=confidence,
+        scope=scope.value,
+    )
+    print(out)
 
 
 @app.command()

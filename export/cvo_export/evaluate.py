@@ -45,11 +45,8 @@ def evaluate(
     calibration = bundle.calibration
     recorded = calibration.calibration.split
     first = calibration.thresholds[0]
-    split: Split | None = None
-    indices = np.arange(len(dataset))
-    if subset == "test":
-        split = same_split(dataset, recorded)
-        indices = split.roles["test"]
+    split = same_split(dataset, recorded) if subset == "test" else None
+    indices = split.roles["test"] if split else np.arange(len(dataset))
     with Odometer(
         bundle, threads=threads, confidence=first.confidence, scope=first.scope
     ) as odometer:
@@ -87,6 +84,18 @@ def evaluate(
                 "levels": [others.level(entry) for entry in entries],
             }
     return report
+
+
+def subset_indices(
+    calibration: Calibration, dataset: PoseDataset, subset: Subset
+) -> NDArray[np.int64]:
+    """Frame numbers of the recorded test role, or all.
+
+    Raises SourceError where the data set is not the one that was split.
+    """
+    if subset == "all":
+        return np.arange(len(dataset))
+    return same_split(dataset, calibration.calibration.split).roles["test"]
 
 
 def point_error(seen: Observed) -> dict[str, float]:

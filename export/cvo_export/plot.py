@@ -1,0 +1,174 @@
+"""A picture of a bundle on a data set: truth, point and set over time, and seen from above."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.errors import SinkError, SourceError, UsageError
+from cvo_edge.odometer import Odometer
+from cvo_edge.pose import Chart, PoseInterval, Scope
+from cvo_export.datasets import PoseDataset
+from cvo_export.evaluate import Subset, subset_indices
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+
+# Colours that differ for colour-blind readers, too (Okabe and Ito 2008).
+_TRUTH, _POINT, _BAND, _MISSED = "#000000", "#0072B2", "#56B4E9", "#D55E00"
+_DPI = 130
+
+
+def plot(
+    bundle_dir: Path,
+    dataset: PoseDataset,
+    out: Path,
+    *,
+    subset: Subset = "test",
+    sequence: str | None = None,
+    confidence: float = 0.9,
+    scope: Scope = "marginal",
+) -> None:
+    """Draw each degree of freedom over the frames, and x against y, into one picture.
+
+    Bands of a set in pieces are drawn apart; frames whose truth is outside are marked. Rotation
+    numbers are shown in degrees, an offset about the prediction as it is. ``sequence`` is a name of
+    the data set's, by default all frames of the subset in their order.
+
+    Raises
+    ------
+    UsageError
+        matplotlib is not installed, or there is no such sequence.
+    SourceError
+        No frame gives a pose.
+    SinkError
+        The picture cannot be written.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UsageError(
+            'plot: expected matplotlib, found none; pip install "cvo-export[plot]"'
+        ) from None
+    with Odometer.load(bundle_dir, confidence=confidence, scope=scope) as odometer:
+        indices = subset_indices(odometer.calibration, dataset, subset)
+        if sequence is not None:
+            if sequence not in dataset.sequence_names:
+                raise UsageError(
+                    f"sequence: expected one of {dataset.sequence_names[0]} to "
+                    f"{dataset.sequence_names[-1]}, found {sequence}"
+                )
+            number = dataset.sequence_names.index(sequence)
+            indices = indices[dataset.sequence[indices] == number]
+        estimates = [_step(odometer, dataset, index) for index in indices.tolist()]
+        rows = [row for row, estimate in enumerate(estimates) if estimate.pose is not None]
+        if not rows:
+            raise SourceError(f"{dataset.name}: expected frames with a pose, found none")
+        figure = Figure(figsize=(15, 11), layout="constrained")
+        grid = figure.add_gridspec(3, 3)
+        truth = _truth(odometer.chart, estimates, dataset.poses[indices])
+        for dof in range(6):
+            axes = figure.add_subplot(grid[dof % 3, dof // 3])
+            _draw_dof(axes, odometer.chart, estimates, truth, rows, dof)
+        _draw_from_above(figure.add_subplot(grid[:2, 2]), estimates, truth, rows)
+        calibration = odometer.calibration
+        figure.suptitle(
+            f"{calibration.name}: {calibration.method}, {calibration.calibration.score} score, "
+            f"{confidence:g} {scope}, {len(rows)} frames of {dataset.name}"
+            + (f", {sequence}" if sequence else "")
+        )
+    try:
+        figure.savefig(out, dpi=_DPI)
+    except (OSError, ValueError) as error:
+        raise SinkError(f"{out}: cannot be written: {error}") from None
+
+
+def _step(odometer: Odometer, dataset: PoseDataset, index: int) -> PoseInterval:
+    try:
+        image: Any = dataset.read_image(index)
+    except SourceError:
+        image = None
+    return odometer.step(image, source=dataset.frame_names[index])
+
+
+def _truth(chart: Chart, estimates: list[PoseInterval], poses: Array) -> Array:
+    """True numbers (n, 6) in the chart as seen from each estimate; NaN where there is none."""
+    truth = np.full((len(estimates), 6), np.nan)
+    for row, (estimate, pose) in enumerate(zip(estimates, poses, strict=True)):
+        if estimate.pose is not None:
+            truth[row] = chart.coordinates(pose, estimate.pose.to_array())
+    return truth
+
+
+def _draw_dof(
+    axes: Axes,
+    chart: Chart,
+    estimates: list[PoseInterval],
+    truth: Array,
+    rows: list[int],
+    dof: int,
+) -> None:
+    scale, unit = (1.0, "m") if dof < 3 else (float(np.rad2deg(1.0)), "deg")
+    shown = scale * truth[rows, dof]
+    point = np.array([chart.point(_array(estimates[row]))[dof] for row in rows])
+    spread = max(float(np.ptp(shown)), 1e-6)
+    low, high = shown.min() - spread, shown.max() + spread
+    bottoms, heights, places, missed = [], [], [], []
+    for row in rows:
+        estimate = estimates[row]
+        bands = (
+            estimate.bands[dof] if estimate.bands else ((estimate.lower[dof], estimate.upper[dof]),)
+        )
+        for start, end in bands:
+            bottom, top = np.clip((scale * start, scale * end), low, high)
+            bottoms.append(bottom)
+            heights.append(top - bottom)
+            places.append(row)
+        if not estimate.region.covers(truth[row])[dof]:
+            missed.append(row)
+    axes.bar(places, heights, 1.0, bottoms, color=_BAND, alpha=0.6, linewidth=0, label="set")
+    axes.plot(rows, scale * point, color=_POINT, linewidth=0.9, label="point")
+    axes.plot(rows, shown, color=_TRUTH, linewidth=0.9, label="truth")
+    axes.plot(missed, scale * truth[missed, dof], "x", color=_MISSED, markersize=5, label="missed")
+    axes.set_ylim(shown.min() - 0.4 * spread, shown.max() + 0.4 * spread)
+    kind = " about the prediction" if dof > 2 and chart.rotation == "tangent_predicted" else ""
+    axes.set_ylabel(f"{chart.dof[dof]} ({unit}){kind}")
+    axes.set_xlabel("frame")
+    axes.margins(x=0.01)
+    if dof == 0:
+        axes.legend(loc="best", ncols=4, fontsize=8)
+
+
+def _draw_from_above(
+    axes: Axes, estimates: list[PoseInterval], truth: Array, rows: list[int]
+) -> None:
+    """X against y: the product of both sets as boxes, for as many frames as can be told apart."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Rectangle
+
+    boxes = []
+    for row in rows[:: max(1, len(rows) // 60)]:
+        plane = np.unique(estimates[row].position_boxes()[:, :2], axis=0)
+        if np.isfinite(plane).all():
+            boxes += [Rectangle((x[0], y[0]), x[1] - x[0], y[1] - y[0]) for x, y in plane]
+    axes.add_collection(PatchCollection(boxes, facecolor=_BAND, edgecolor=_POINT, alpha=0.25))
+    points = np.array([_array(estimates[row])[:2] for row in rows])
+    axes.plot(*points.T, ".", color=_POINT, markersize=3, label="point")
+    axes.plot(*truth[rows, :2].T, ".", color=_TRUTH, markersize=3, label="truth")
+    axes.set_xlabel("tx (m)")
+    axes.set_ylabel("ty (m)")
+    axes.set_aspect("equal", "datalim")
+    axes.set_title("x and y, sets of every so many frames", fontsize=10)
+    axes.legend(loc="best", fontsize=8)
+
+
+def _array(estimate: PoseInterval) -> Array:
+    """The pose (7,) of an estimate that has one."""
+    if estimate.pose is None:
+        raise UsageError(f"frame {estimate.seq} is invalid: it has no pose")
+    return estimate.pose.to_array()
