@@ -68,6 +68,13 @@ class BoundsName(StrEnum):
     FREE = "free"
 
 
+class PointLossName(StrEnum):
+    """Loss of the point."""
+
+    ABSOLUTE = "absolute"
+    SQUARED = "squared"
+
+
 class GateName(StrEnum):
     """Which coverage gates the calibration loss."""
 
@@ -207,6 +214,10 @@ def train(
     sharpness: Annotated[
         float | None, typer.Option(min=0, max=1, help="cjp: lambda of the calibration loss, 0.5.")
     ] = None,
+    point_loss: Annotated[
+        PointLossName | None,
+        typer.Option(help="cjp: absolute by default; squared: the paper's."),
+    ] = None,
     gate: Annotated[
         GateName | None, typer.Option(help="cjp: corrected by default; literal: Eq. 5a.")
     ] = None,
@@ -280,6 +291,7 @@ def train(
             "latent": latent,
             "bounds": bounds,
             "sharpness": sharpness,
+            "point_loss": point_loss,
             "gate": gate,
             "interval_form": interval_form,
             "kl_weight": kl_weight,

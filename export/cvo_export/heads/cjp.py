@@ -48,7 +48,10 @@ _CODEBOOK_SIZE = 16
 
 
 class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unknown_fields=True):
-    """The choices of method and loss; the paper's are latent_size 3, gate literal, latent sample.
+    """The choices of method and loss.
+
+    The paper's are latent_size 3, latent sample, point_loss squared, gate literal and interval_form
+    mean.
 
     Attributes
     ----------
@@ -64,6 +67,9 @@ class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unkno
         Widths of the encoder's two layers, mirrored in the decoder.
     sharpness
         lambda of the combined calibration loss, 0 (calibration) to 1 (sharpness).
+    point_loss
+        Of the point: ``absolute``, as a few frames far off would pull a mean away from the middle
+        of the interval, or ``squared``.
     gate, interval_form
         Variants of the loss, see ``cvo_export.losses``.
     kl_weight
@@ -79,6 +85,7 @@ class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unkno
     bounds: Bounds = "softplus"
     hidden: tuple[int, int] = (256, 128)
     sharpness: Annotated[float, Meta(ge=0, le=1)] = 0.5
+    point_loss: Literal["absolute", "squared"] = "absolute"
     gate: Gate = "corrected"
     interval_form: IntervalForm = "proper"
     kl_weight: Annotated[float, Meta(ge=0)] = 1e-3
@@ -136,7 +143,7 @@ class CjpNetwork(nn.Module):
 
 
 class CjpLearner(Learner):
-    """The network with Eq. 6: MSE + beta KL + INTSCORE + COMCAL, on standardised numbers."""
+    """The network with Eq. 6: point + beta KL + INTSCORE + COMCAL, on standardised numbers."""
 
     def __init__(self, size: int, config: CjpConfig) -> None:
         super().__init__()
@@ -154,8 +161,9 @@ class CjpLearner(Learner):
     def of_prediction(self, prediction: CjpPrediction, y: Tensor, warm_up: bool) -> Tensor:
         """Prediction and truth (n, 6) -> scalar."""
         point, lower, upper, mu, log_variance = prediction
+        error = point - y
         loss = (
-            (point - y).square().mean()
+            (error.abs() if self.config.point_loss == "absolute" else error.square()).mean()
             + self.config.kl_weight * kl_divergence(mu, log_variance)
             + interval_score_loss(lower, upper, y, self.config.interval_form)
         )

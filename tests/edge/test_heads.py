@@ -1,0 +1,248 @@
+"""Every head's set is {y : score(y) <= q_hat}, with what its method adds to it."""
+
+import numpy as np
+import pytest
+
+from cvo_edge.artifact import Threshold
+from cvo_edge.errors import CalibrationFileError
+from cvo_edge.heads.cqr import IntervalScore
+from cvo_edge.heads.csp import Score, class_scores
+
+FLOOR = [0.01] * 6
+GRID = np.linspace(-3.0, 3.0, 241)
+
+
+def threshold(q_hat, q_hat_upper=None):
+    upper = None if q_hat_upper is None else tuple(q_hat_upper)
+    return Threshold(confidence=0.9, scope="marginal", q_hat=tuple(q_hat), q_hat_upper=upper)
+
+
+# -- intervals ----------------------------------------------------------------------------------
+
+
+def bounds(seed):
+    generator = np.random.default_rng(seed)
+    point = generator.normal(0.0, 0.5, (1, 6))
+    lower = point - generator.uniform(0.05, 0.8, (1, 6))
+    upper = point + generator.uniform(0.05, 0.8, (1, 6))
+    return {"lower": lower.astype(np.float32), "upper": upper.astype(np.float32)}, point
+
+
+@pytest.mark.parametrize("score", ["additive", "normalised", "residual"])
+@pytest.mark.parametrize("q_hat", [0.0, 0.3, 1.7, None])
+def test_an_interval_is_exactly_where_the_symmetric_score_is_at_most_q(make_head, score, q_hat):
+    head = make_head("cqr", score, {"half_width_floor": FLOOR, "sides": "symmetric"})
+    outputs, point = bounds(3)
+    if score == "residual":
+        outputs = {}
+    region = head.region(outputs, point[0], threshold([q_hat] * 6))
+    limit = np.inf if q_hat is None else q_hat
+    for y in GRID:
+        scores = head.scores(outputs, point, np.full((1, 6), y))
+        assert scores.shape == (1, 1, 6)
+        near = np.isclose(scores[0, 0], limit, atol=1e-9)
+        inside = region.covers(np.full(6, y))
+        np.testing.assert_array_equal(inside | near, (scores[0, 0] <= limit) | near)
+
+
+@pytest.mark.parametrize("score", ["additive", "normalised"])
+def test_two_sides_have_a_threshold_each(make_head, score):
+    parameters = {"half_width_floor": FLOOR, "sides": "asymmetric"}
+    head = make_head("cqr", score, parameters, q_hat_upper=(None,) * 6)
+    outputs, point = bounds(5)
+    region = head.region(outputs, point[0], threshold([0.2] * 6, [0.9] * 6))
+    for y in GRID:
+        below, above = head.scores(outputs, point, np.full((1, 6), y))[0]
+        near = np.isclose(below, 0.2, atol=1e-9) | np.isclose(above, 0.9, atol=1e-9)
+        expected = (below <= 0.2) & (above <= 0.9)
+        np.testing.assert_array_equal(region.covers(np.full(6, y)) | near, expected | near)
+
+
+@pytest.mark.parametrize(
+    ("sides", "confidences"),
+    [
+        ("symmetric", (0.9,)),
+        ("asymmetric", (0.95, 0.95)),
+        ("lower", (0.9, None)),
+        ("upper", (None, 0.9)),
+    ],
+)
+def test_miscoverage_is_shared_by_the_sides_that_are_bounded(make_head, sides, confidences):
+    upper = None if sides == "symmetric" else (None,) * 6
+    parameters = {"half_width_floor": FLOOR, "sides": sides}
+    head = make_head("cqr", "additive", parameters, q_hat_upper=upper)
+    assert head.side_confidences(0.9) == pytest.approx(confidences)
+
+
+def test_a_lower_bound_alone_leaves_the_upper_side_open(make_head):
+    parameters = {"half_width_floor": FLOOR, "sides": "lower"}
+    head = make_head("cqr", "additive", parameters, q_hat_upper=(None,) * 6)
+    outputs, point = bounds(1)
+    region = head.region(outputs, point[0], threshold([0.1] * 6, [None] * 6))
+    np.testing.assert_allclose(region.lower, outputs["lower"][0] - 0.1)
+    assert (region.upper == np.inf).all()
+
+
+def test_a_set_emptied_by_a_negative_threshold_is_its_middle():
+    lower, upper, point = np.full(6, -0.1), np.full(6, 0.3), np.zeros(6)
+    region = IntervalScore(None).inverse(lower, upper, point, np.full(6, -0.5), np.full(6, -0.5))
+    assert region.crossed
+    np.testing.assert_allclose(region.lower, 0.1)
+    np.testing.assert_allclose(region.upper, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("method", "score", "parameters", "upper", "match"),
+    [
+        ("cqr", "aps", {"half_width_floor": FLOOR, "sides": "symmetric"}, None, "score"),
+        ("cjp", "residual", None, None, "score"),
+        ("cqr", "additive", {"half_width_floor": FLOOR, "sides": "both"}, None, "sides"),
+        ("cqr", "additive", {"half_width_floor": FLOOR, "sides": "lower"}, None, "six values"),
+        ("cqr", "additive", {"half_width_floor": FLOOR, "sides": "symmetric"}, (0.1,) * 6, "null"),
+        ("cqr", "additive", {"half_width_floor": FLOOR}, None, "sides"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused(
+    make_head, bundle, method, score, parameters, upper, match
+):
+    parameters = parameters or bundle.calibration.method_parameters
+    with pytest.raises(CalibrationFileError, match=match):
+        make_head(method, score, parameters, q_hat_upper=upper)
+
+
+@pytest.mark.parametrize("score", ["normalised", "residual"])
+def test_a_negative_factor_is_refused_where_the_score_cannot_be_negative(make_head, score):
+    parameters = {"half_width_floor": FLOOR, "sides": "symmetric"}
+    with pytest.raises(CalibrationFileError, match="factors of at least 0"):
+        make_head("cqr", score, parameters, q_hat=(-0.1,) * 6)
+
+
+# -- classes ------------------------------------------------------------------------------------
+
+EDGES = [
+    [-2.0, -1.0, 0.0, 0.5, 1.0, 2.0],
+    [-2.0, 0.0, 2.0],  # two classes only: three probabilities go unused
+    [-1.5, -0.5, 0.0, 0.25, 1.0, 1.5],
+    [-2.0, -1.0, 0.0, 1.0, 2.0],
+    [-0.5, -0.25, 0.0, 0.25, 0.5, 0.75],
+    [-3.0, -1.0, -0.5, 0.0, 1.0, 3.0],
+]
+
+
+def parameters(penalty=0.0, free_ranks=0):
+    return {"edges": EDGES, "penalty": penalty, "free_ranks": free_ranks}
+
+
+def probabilities(seed):
+    generator = np.random.default_rng(seed)
+    p = np.zeros((1, 6, 5), np.float32)
+    for dof, edges in enumerate(EDGES):
+        count = len(edges) - 1
+        p[0, dof, :count] = generator.dirichlet(np.full(count, 0.4))
+    return {"probabilities": p}
+
+
+@pytest.mark.parametrize("score", list(Score))
+@pytest.mark.parametrize("q_hat", [0.0, 0.3, 0.6, 0.9, 1.1])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_set_of_classes_is_where_the_score_is_at_most_q_and_the_likeliest_class(
+    make_head, seed, score, q_hat
+):
+    head = make_head("csp", str(score), parameters(0.05, 2))
+    outputs = probabilities(seed)
+    region = head.region(outputs, np.zeros(6), threshold([q_hat] * 6))
+    likeliest = outputs["probabilities"][0].argmax(axis=1)
+    for dof, edges in enumerate(EDGES):
+        for number in range(len(edges) - 1):
+            y = np.full(6, 0.5 * (edges[number] + edges[number + 1]))
+            score_of_y = head.scores(outputs, np.zeros((1, 6)), y[None])[0, 0, dof]
+            expected = score_of_y <= q_hat or number == likeliest[dof]
+            assert region.covers(y)[dof] == expected
+
+
+def test_adjacent_classes_merge_and_others_stay_apart(make_head):
+    head = make_head("csp", "lac", parameters())
+    p = np.zeros((1, 6, 5), np.float32)
+    p[0, 0] = [0.4, 0.0, 0.0, 0.3, 0.3]
+    p[0, 1, :2] = [0.5, 0.5]
+    p[0, 2:] = [0.2, 0.2, 0.2, 0.2, 0.2]
+    region = head.region({"probabilities": p}, np.zeros(6), threshold([0.75] * 6))
+    assert region.bands[0] == ((-2.0, -1.0), (0.5, 2.0))
+    assert region.bands[1] == ((-2.0, 2.0),)
+    assert region.lower[0] == -2.0
+    assert region.upper[0] == 2.0
+    np.testing.assert_array_equal(region.covers([-1.5, 0, 0, 0, 0, 0])[0], True)
+    np.testing.assert_array_equal(region.covers([-0.5, 0, 0, 0, 0, 0])[0], False)
+    assert region.width()[0] == pytest.approx(2.5)
+    assert region.distance([0.25, 0, 0, 0, 0, 0])[0] == pytest.approx(0.25)
+    assert head.classes_in(region).tolist() == [3, 2, 1, 1, 1, 1]
+
+
+def test_no_set_is_empty_and_none_leaves_the_workspace(make_head):
+    head = make_head("csp", "aps", parameters())
+    for seed in range(50):
+        outputs = probabilities(seed)
+        smallest = head.region(outputs, np.zeros(6), threshold([0.0] * 6))
+        assert (smallest.width() > 0).all()
+        largest = head.region(outputs, np.zeros(6), threshold([2.0] * 6))
+        assert largest.lower.tolist() == [row[0] for row in EDGES]
+        assert largest.upper.tolist() == [row[-1] for row in EDGES]
+
+
+def test_an_unbounded_threshold_is_everything_and_the_others_stay(make_head):
+    head = make_head("csp", "aps", parameters())
+    region = head.region(probabilities(0), np.zeros(6), threshold([None, *[0.5] * 5]))
+    assert region.bands[0] == ((-np.inf, np.inf),)
+    assert region.covers([1e9, 0, 0, 0, 0, 0])[0]
+    assert np.isfinite(region.lower[1:]).all()
+    limited = region.within(np.full(6, -5.0), np.full(6, 5.0))
+    assert limited.width()[0] == 10.0
+    assert limited.bands[1:] == region.bands[1:]
+
+
+def test_a_truth_outside_the_workspace_has_an_infinite_score(make_head):
+    head = make_head("csp", "aps", parameters())
+    outputs = probabilities(0)
+    inside = head.scores(outputs, np.zeros((1, 6)), np.zeros((1, 6)))
+    outside = head.scores(outputs, np.zeros((1, 6)), np.full((1, 6), 9.0))
+    assert np.isfinite(inside).all()
+    assert np.isinf(outside).all()
+
+
+def test_scores_of_stacked_frames_are_those_of_each_to_the_last_bit(make_head):
+    head = make_head("csp", "raps", parameters(0.01, 1))
+    p = np.concatenate([probabilities(seed)["probabilities"] for seed in range(20)])
+    y = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 6))
+    stacked = head.scores({"probabilities": p}, y, y)
+    for row in range(20):
+        one = {"probabilities": p[row : row + 1]}
+        np.testing.assert_array_equal(head.scores(one, y[:1], y[row : row + 1])[0], stacked[row])
+
+
+def test_aps_of_the_last_ranked_class_is_the_whole_mass():
+    p = np.random.default_rng(0).dirichlet(np.ones(9), size=(4, 6))
+    assert class_scores(p, Score.APS).max(axis=-1) == pytest.approx(np.ones((4, 6)))
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"edges": [[0.0, 0.0, 1.0], *EDGES[1:]]}, "ascending"),
+        ({"edges": [[1.0, 0.5, 2.0], *EDGES[1:]]}, "ascending"),
+        ({"edges": [[0.0, 1.0], *EDGES[1:]]}, "edges"),
+        ({"edges": EDGES[:5]}, "edges"),
+        ({"penalty": -1.0}, "penalty"),
+        ({"free_ranks": -1}, "free_ranks"),
+        ({"more": 1}, "more"),
+    ],
+)
+def test_class_parameters_that_do_not_fit_are_refused(make_head, change, match):
+    with pytest.raises(CalibrationFileError, match=match):
+        make_head("csp", "aps", {**parameters(), **change})
+
+
+def test_a_score_or_a_side_of_another_method_is_refused(make_head):
+    with pytest.raises(CalibrationFileError, match="lac, aps, raps"):
+        make_head("csp", "additive", parameters())
+    with pytest.raises(CalibrationFileError, match="q_hat_upper"):
+        make_head("csp", "aps", parameters(), q_hat_upper=(0.5,) * 6)
