@@ -6,13 +6,15 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 from hypothesis import settings
 
 from cvo_edge import artifact
-from cvo_edge.artifact import Bundle, Calibration
+from cvo_edge.artifact import Bundle, Calibration, Threshold
+from cvo_edge.heads import HEADS, Head
 
 # Shared machines are slow now and then: a law that holds late still holds.
 settings.register_profile("project", deadline=None)
@@ -53,6 +55,31 @@ def rewrite(copied_bundle: Path) -> Callable[[Calibration], Path]:
         return copied_bundle
 
     return write
+
+
+@pytest.fixture(scope="session")
+def make_head(bundle: Bundle) -> Callable[..., Head]:
+    """Head of a method with these parameters, score and thresholds at 0.9 marginal."""
+
+    def make(
+        method: str,
+        score: str,
+        parameters: dict[str, Any],
+        q_hat: Any = (None,) * 6,
+        q_hat_upper: Any = None,
+    ) -> Head:
+        entry = Threshold(confidence=0.9, scope="marginal", q_hat=q_hat, q_hat_upper=q_hat_upper)
+        source = msgspec.structs.replace(bundle.calibration.calibration, score=score)
+        calibration: Calibration = msgspec.structs.replace(
+            bundle.calibration,
+            method=method,
+            method_parameters=parameters,
+            thresholds=(entry,),
+            calibration=source,
+        )
+        return HEADS[method](calibration)
+
+    return make
 
 
 @pytest.fixture(scope="session")

@@ -32,6 +32,8 @@ _LEAST_DEVIATION = 1e-6
 
 # How far beyond the known poses a pose is still plausible, in ranges of each DoF.
 _LIMIT_MARGIN = 0.5
+# The same in metres and radians, where the known poses may be few.
+FEW_POSES_MARGIN = 1.0
 _SELFTEST_TOLERANCE = 1e-3
 # Of another shape than any camera and model, so that resize and crop are tested, too.
 _SELFTEST_SIZE = (418, 650)
@@ -115,15 +117,18 @@ def known_space(
     spread = float(np.linalg.norm(coordinates[:, 3:], axis=1).max())
     return (
         four(reference) if spread <= MAX_SPREAD_RAD else None,
-        plausible(coordinates),
+        plausible(coordinates, FEW_POSES_MARGIN),
         six(np.maximum(coordinates.std(axis=0), _LEAST_DEVIATION)),
     )
 
 
-def plausible(coordinates: Array) -> artifact.PoseLimits:
-    """Limits around known poses (n, 6), half of their range wider on each side."""
+def plausible(coordinates: Array, least_margin: float = 0.0) -> artifact.PoseLimits:
+    """Limits around known poses (n, 6), half of their range wider on each side.
+
+    At least by ``least_margin``, metres and radians: few poses span little of where a camera goes.
+    """
     lowest, highest = coordinates.min(axis=0), coordinates.max(axis=0)
-    margin = np.maximum(_LIMIT_MARGIN * (highest - lowest), _LEAST_DEVIATION)
+    margin = np.maximum(_LIMIT_MARGIN * (highest - lowest), least_margin)
     return artifact.PoseLimits(lowest=six(lowest - margin), highest=six(highest + margin))
 
 

@@ -6,7 +6,6 @@ times faster than torch on a CPU, and exactly what the device will compute.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -20,11 +19,11 @@ from cvo_edge.session import Session, allowed_cores
 from cvo_export.augment import AugmentConfig, augmented, model_intrinsics
 from cvo_export.backbone import Backbone
 from cvo_export.datasets import PoseDataset
+from cvo_export.progress import Progress
 from cvo_export.to_onnx import export_onnx
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-Progress = Callable[[str, int, int], None]
 
 
 class ModelImages:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from cvo_export.features import Progress
+# What is done, how much of it, of how much.
+Progress = Callable[[str, int, int], None]
 
 _SECONDS_BETWEEN_LINES = 15.0
 

@@ -25,6 +25,7 @@ from cvo_edge.heads.cqr import CqrParameters, Sides
 from cvo_edge.preprocess import Crop
 from cvo_export.bundle import (
     CAMERA_FRAME,
+    FEW_POSES_MARGIN,
     HALF_WIDTH_FLOOR,
     WORLD_FRAME,
     blank_selftest,
@@ -237,9 +238,11 @@ def _with_wider_limits(calibration: Calibration, poses: Array) -> Calibration:
     """Let a bundle's limits hold the poses (n, 7) of the new data, too."""
     pose = calibration.pose
     if pose.reference_q_xyzw is None:
-        found = _with_any_rotation(plausible(known_coordinates(poses, mean_rotation(poses[:, 3:]))))
+        coordinates = known_coordinates(poses, mean_rotation(poses[:, 3:]))
+        found = _with_any_rotation(plausible(coordinates, FEW_POSES_MARGIN))
     else:
-        found = plausible(known_coordinates(poses, np.array(pose.reference_q_xyzw)))
+        coordinates = known_coordinates(poses, np.array(pose.reference_q_xyzw))
+        found = plausible(coordinates, FEW_POSES_MARGIN)
     limits = PoseLimits(
         lowest=six(np.minimum(pose.limits.lowest, found.lowest)),
         highest=six(np.maximum(pose.limits.highest, found.highest)),

@@ -11,7 +11,8 @@ import hashlib
 import json
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,9 +28,10 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from cvo_edge.errors import UsageError
 from cvo_export.backbone import Backbone, load_weights
 from cvo_export.datasets import PoseDataset
-from cvo_export.features import FeatureExtractor, ModelImages, Progress, cached_copies
+from cvo_export.features import FeatureExtractor, ModelImages, cached_copies
 from cvo_export.heads import METHODS, Setting
 from cvo_export.heads.base import L, Learner
+from cvo_export.progress import Progress
 from cvo_export.run import History, PoseGraph, Run, TrainConfig, claim_run, open_run
 from cvo_export.splits import deal_folds
 from cvo_export.target import Target, fit_target
@@ -215,7 +217,8 @@ class _Lesson:
             return x[copy, frame].float(), y[copy, frame]
 
         groups = [{"params": list(self.learner.parameters()), "peak": self.config.learning_rate}]
-        self._loop(phase, self.name, groups, self.config.steps, batch, lambda _: val, state)
+        with _one_thread():
+            self._loop(phase, self.name, groups, self.config.steps, batch, lambda _: val, state)
 
     def _fit_all(self, phase: int, state: dict[str, Any] | None) -> None:
         """Train backbone and head together on fresh augmented images."""
@@ -370,6 +373,17 @@ def _features_folder(
     }
     text = json.dumps(decisive, sort_keys=True)
     return cache / hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep torch to one thread: a batch of 64 rows is too little for two to share."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _lesson_seed(seed: int, name: str) -> int:

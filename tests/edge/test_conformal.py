@@ -99,7 +99,7 @@ def test_linear_scale_is_the_ninety_percent_quantile_of_the_size():
     np.testing.assert_array_equal(LinearScale.fitted(scores).scales, expected)
 
 
-unit_scores = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=40)
+unit_scores = st.lists(st.integers(0, 10**6).map(lambda v: v / 1e6), min_size=1, max_size=40)
 
 
 @given(unit_scores, unit_scores, st.sampled_from([1.0, 1.7]))

@@ -9,6 +9,7 @@ from cvo_edge.conformal import (
     conformal_rank,
     hierarchical_quantile,
 )
+from cvo_export.calibrate import thresholds
 
 REPEATS = 1000
 
@@ -59,3 +60,138 @@ def test_hierarchical_rule_covers_new_sequences_where_pooling_does_not():
     error = np.std(hierarchical) / np.sqrt(REPEATS)
     assert np.mean(hierarchical) > 0.9 - 4.5 * error
     assert np.mean(pooled) < 0.89
+
+
+# -- through the heads: calibrated and judged as bundles are --------------------------------------
+
+TRIALS = 20
+CONFIDENCE = 0.9
+FLOOR = [0.01] * 6
+CQR = {"half_width_floor": FLOOR, "sides": "symmetric"}
+CLASSES = {"edges": [np.linspace(-4.0, 4.0, 13).tolist()] * 6, "penalty": 0.05, "free_ranks": 3}
+METHODS = [
+    ("cqr", "additive", CQR),
+    ("cqr", "normalised", CQR),
+    ("cqr", "residual", CQR),
+    ("csp", "lac", CLASSES),
+    ("csp", "aps", CLASSES),
+    ("csp", "raps", CLASSES),
+]
+
+
+def frames(count, seed):
+    """Outputs, points and truths (count, 6) of a model whose uncertainty is right on average."""
+    generator = np.random.default_rng(seed)
+    point = generator.standard_normal((count, 6))
+    spread = 0.1 + 0.5 * generator.random((count, 6))
+    truth = point + spread * generator.standard_t(5, (count, 6))
+    edges = np.array(CLASSES["edges"][0])
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    logits = -0.5 * ((middle - point[..., None]) / (1.3 * spread[..., None])) ** 2
+    # Noise, so that ranks differ from distances and no two scores are the same.
+    p = np.exp(logits + 0.7 * generator.standard_normal(logits.shape))
+    outputs = {
+        "lower": (point - 1.2 * spread).astype(np.float32),
+        "upper": (point + 1.2 * spread).astype(np.float32),
+        "probabilities": (p / p.sum(axis=-1, keepdims=True)).astype(np.float32),
+    }
+    return outputs, point, truth
+
+
+def standard_error(mean, n, columns=6):
+    """Of the mean coverage: Beta between calibrations, binomial within one."""
+    variance = mean * (1 - mean) * (1 / (n + 2) + 1 / TRIALS)
+    return np.sqrt(variance / (REPEATS * columns))
+
+
+@pytest.mark.parametrize("n", [19, 20, 100])
+@pytest.mark.parametrize(("method", "score", "parameters"), METHODS)
+def test_scores_are_at_most_the_threshold_in_rank_over_n_plus_one(
+    make_head, method, score, parameters, n
+):
+    head = make_head(method, score, parameters)
+    outputs, point, truth = frames(REPEATS * (n + TRIALS), n)
+    scores = head.scores(outputs, point, truth).reshape(REPEATS, n + TRIALS, 6)
+    covered = [
+        (repeat[n:] <= np.array([conformal_quantile(s, CONFIDENCE) for s in repeat[:n].T])).mean()
+        for repeat in scores
+    ]
+    expected = conformal_rank(n, CONFIDENCE) / (n + 1)
+    # Two-sided: neither too little nor too much.
+    assert abs(np.mean(covered) - expected) < 4.5 * standard_error(expected, n)
+
+
+def coverages(head, n, joint="max"):
+    """Per DoF and jointly: (marginal sets, their hulls, joint sets), means over all repeats."""
+    outputs, point, truth = frames(REPEATS * (n + TRIALS) + 200, n)
+    scores = head.scores(outputs, point, truth)
+    val, scores = scores[-200:], scores[:-200]
+    marginal, hulls, jointly = [], [], []
+    for repeat in range(REPEATS):
+        start = repeat * (n + TRIALS)
+        cal = scores[start : start + n]
+        entries = thresholds(head, cal, np.zeros(n, np.int64), val, "pooled", joint)
+        by_scope = {e.scope: e for e in entries if e.confidence == CONFIDENCE}
+        for row in range(start + n, start + n + TRIALS, 5):
+            one = {name: values[row : row + 1] for name, values in outputs.items()}
+            inner, outer = (head.region(one, point[row], by_scope[s]) for s in by_scope)
+            y = truth[row]
+            marginal.append(inner.covers(y).mean())
+            hulls.append(((inner.lower <= y) & (y <= inner.upper)).mean())
+            jointly.append(outer.covers(y).all())
+    return np.mean(marginal), np.mean(hulls), np.mean(jointly)
+
+
+@pytest.mark.parametrize("n", [19, 20, 100])
+@pytest.mark.parametrize(("method", "score", "parameters"), METHODS)
+def test_sets_and_their_hulls_cover_at_least_that_and_joint_sets_all_six(
+    make_head, method, score, parameters, n
+):
+    head = make_head(method, score, parameters)
+    marginal, hull, jointly = coverages(head, n)
+    least = conformal_rank(n, CONFIDENCE) / (n + 1)
+    assert marginal > least - 4.5 * 2 * standard_error(least, n)
+    assert hull >= marginal
+    assert jointly > least - 4.5 * 2 * standard_error(least, n, columns=1)
+
+
+@pytest.mark.parametrize("n", [20, 100])
+@pytest.mark.parametrize(("method", "score", "parameters"), [METHODS[1], METHODS[4]])
+def test_bonferroni_holds_jointly_or_says_that_it_cannot(make_head, method, score, parameters, n):
+    head = make_head(method, score, parameters)
+    _, _, jointly = coverages(head, n, "bonferroni")
+    assert jointly > CONFIDENCE - 4.5 * 2 * standard_error(CONFIDENCE, n, columns=1)
+    # A sixth of the miscoverage needs 59 frames.
+    assert bool(jointly == 1.0) is (n < 59)
+
+
+@pytest.mark.parametrize("n", [19, 20, 100])
+@pytest.mark.parametrize("score", ["additive", "normalised"])
+def test_two_thresholds_at_half_the_miscoverage_cover_what_their_ranks_say(make_head, score, n):
+    parameters = {"half_width_floor": FLOOR, "sides": "asymmetric"}
+    head = make_head("cqr", score, parameters, q_hat_upper=(None,) * 6)
+    outputs, point, truth = frames(REPEATS * (n + TRIALS), n)
+    scores = head.scores(outputs, point, truth).reshape(REPEATS, n + TRIALS, 2, 6)
+    levels = head.side_confidences(CONFIDENCE)
+    covered = []
+    for repeat in scores:
+        q_hat = np.array(
+            [
+                [conformal_quantile(repeat[:n, side, dof], levels[side]) for dof in range(6)]
+                for side in range(2)
+            ]
+        )
+        covered.append((repeat[n:] <= q_hat).all(axis=1).mean())
+    expected = 2 * conformal_rank(n, 1 - (1 - CONFIDENCE) / 2) / (n + 1) - 1
+    assert abs(np.mean(covered) - expected) < 4.5 * standard_error(expected, n)
+
+
+@pytest.mark.parametrize("sides", ["lower", "upper"])
+def test_one_bound_covers_at_the_whole_level(make_head, sides):
+    n = 100
+    parameters = {"half_width_floor": FLOOR, "sides": sides}
+    head = make_head("cqr", "additive", parameters, q_hat_upper=(None,) * 6)
+    marginal, _, jointly = coverages(head, n)
+    expected = conformal_rank(n, CONFIDENCE) / (n + 1)
+    assert abs(marginal - expected) < 4.5 * 2 * standard_error(expected, n)
+    assert abs(jointly - expected) < 4.5 * 2 * standard_error(expected, n, columns=1)
