@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 RESULTS = Path(__file__).parent / "results"
+METHODS = ("cjp", "cqr", "csp")
 HEADER = (
-    "| recording, split | median error | score | coverage at 0.9, per DoF | joint scope: all six "
-    "| median width |\n|---|---|---|---|---|---|"
+    "| recording, split | method | median error | score | coverage at 0.9, per DoF "
+    "| joint scope: all six | median width |\n|---|---|---|---|---|---|---|"
 )
 
 
@@ -34,13 +35,14 @@ def cell(values: list[float], form: str) -> str:
     return f"**{form.format(float(np.median(values)))}** ({each})"
 
 
-def row(recording: str, reports: list[dict[str, Any]]) -> str:
-    """Return the recording's line of the table."""
+def row(recording: str, method: str, reports: list[dict[str, Any]]) -> str:
+    """Return a line of the table."""
     marginal = [level(report, "marginal") for report in reports]
     joint = [level(report, "joint") for report in reports]
     widths = np.array([entry["median_width"] for entry in marginal])
     cells = [
         f"{recording}, {reports[0]['split']}",
+        method,
         cell([100 * report["point_error"]["median_m"] for report in reports], "{:.2f}")
         + " cm, "
         + cell([report["point_error"]["median_deg"] for report in reports], "{:.2f}")
@@ -59,8 +61,10 @@ def main() -> None:
     """Print the table of the recordings named on the command line."""
     print(HEADER)
     for recording in sys.argv[1:]:
-        paths = sorted(RESULTS.glob(f"{recording}-[0-9].json"))
-        print(row(recording, [json.loads(path.read_text("utf-8")) for path in paths]))
+        for method in METHODS:
+            paths = sorted(RESULTS.glob(f"{method}-{recording}-[0-9].json"))
+            if paths:
+                print(row(recording, method, [json.loads(p.read_text("utf-8")) for p in paths]))
 
 
 if __name__ == "__main__":
