@@ -4,13 +4,14 @@ PYTHON ?= python3
 TORCH_PIP_OPTIONS ?=
 VENV := .venv
 DEMO_VENV := .venv-demo
-BUNDLE := calibration_artifacts/synthetic-room-cjp
+METHODS := cjp cqr csp
+BUNDLE := calibration_artifacts/synthetic-room
 CLIP := calibration_artifacts/synthetic-room-clip
 
 .PHONY: help demo test check format clean
 
 help:
-	@echo "make demo    install the runtime alone and run a demonstration bundle on a sample clip"
+	@echo "make demo    install the runtime alone and run the demonstration bundles on a sample clip"
 	@echo "make test    install both packages and run the test-suite (CVO_DATA: real data, optional)"
 	@echo "make check   lint, formatting, types and import rules"
 	@echo "make format  reformat the code"
@@ -27,11 +28,15 @@ $(VENV)/.installed: pyproject.toml export/pyproject.toml
 	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable "./export[plot]"
 	@touch $@
 
-demo: $(DEMO_VENV)/.installed
-	$(DEMO_VENV)/bin/cvo-edge verify $(BUNDLE)
-	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE) $(CLIP) --ground-truth $(CLIP) --format table --max-frames 8 --quiet
-	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE) $(CLIP) --ground-truth $(CLIP) --output demo.jsonl
-	@echo "every frame's record: demo.jsonl"
+demo: $(addprefix demo-,$(METHODS))
+	@echo "every frame's record: $(addprefix demo-,$(METHODS:=.jsonl))"
+	@echo "each bundle alone: make $(addprefix demo-,$(METHODS))"
+
+demo-%: $(DEMO_VENV)/.installed
+	@echo "== synthetic-room-$*"
+	$(DEMO_VENV)/bin/cvo-edge verify $(BUNDLE)-$*
+	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE)-$* $(CLIP) --format table --max-frames 4 --quiet
+	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE)-$* $(CLIP) --ground-truth $(CLIP) --output demo-$*.jsonl
 
 test: $(VENV)/.installed
 	$(VENV)/bin/python -m pytest
@@ -47,4 +52,4 @@ format: $(VENV)/.installed
 	$(VENV)/bin/ruff format .
 
 clean:
-	rm -rf $(VENV) $(DEMO_VENV) demo.jsonl
+	rm -rf $(VENV) $(DEMO_VENV) $(addprefix demo-,$(METHODS:=.jsonl))
