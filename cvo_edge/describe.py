@@ -9,6 +9,8 @@ import msgspec
 
 from cvo_edge.artifact import Calibration, CalibrationSpec
 from cvo_edge.heads import HEADS
+from cvo_edge.heads.cqr import CqrParameters
+from cvo_edge.heads.csp import CspParameters
 from cvo_edge.pose import Chart
 
 
@@ -20,14 +22,15 @@ def inspect_lines(calibration: Calibration) -> list[str]:
     dof = Chart(pose.rotation).dof
     lines = [
         f"name         {calibration.name}",
-        f"method       {calibration.method}, {source.score} score",
+        f"method       {calibration.method}, {source.score} score{_details(calibration)}",
         f"model        {model.precision}, opset {model.opset}, sha256 {model.sha256[:16]}...",
         f"tensors      {tensors}",
         f"pose         {pose.target}, {pose.child_frame_id} in {pose.frame_id}, {pose.rotation}",
         f"calibrated   on {source.n} frames of {source.n_sequences} sequence(s) of "
         f"{source.dataset}, split {source.split.kind} (seed {source.split.seed}), {source.rule}"
         + _worth(source),
-        f"backbone     {calibration.provenance.backbone}",
+        f"joint        by {source.joint}",
+        f"backbone     {calibration.provenance.backbone or 'a given network'}",
         "",
         f"{'q_hat at':<16}" + "".join(f"{name:>11}" for name in dof),
     ]
@@ -39,6 +42,22 @@ def inspect_lines(calibration: Calibration) -> list[str]:
             cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>11}" for v in values)
             lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<16}" + cells)
     return lines + _unbounded(calibration)
+
+
+def _details(calibration: Calibration) -> str:
+    """Sides of a method that has some, classes of one that has those.
+
+    Raises CalibrationFileError where the parameters are not the method's.
+    """
+    if calibration.method not in HEADS:
+        return ""
+    parameters = calibration.parameters(HEADS[calibration.method].parameters_type)
+    if isinstance(parameters, CqrParameters):
+        return f", {parameters.sides}"
+    if isinstance(parameters, CspParameters):
+        counts = [len(row) - 1 for row in parameters.edges]
+        return f", {min(counts)} to {max(counts)} classes a degree of freedom"
+    return ""
 
 
 def _unbounded(calibration: Calibration) -> list[str]:
