@@ -68,9 +68,10 @@ def test_a_finished_run_is_read_back_and_publishes_the_same_bundle(runs, method,
     assert second.calibration.thresholds == first.calibration.thresholds
 
 
-@pytest.mark.parametrize("calls", [3, 25])
-def test_an_interrupted_run_ends_as_if_it_never_was(runs, method, tmp_path, calls):
+def test_an_interrupted_run_ends_as_if_it_never_was(runs, method, tmp_path):
     _, run, _ = runs(method)
+    # For CQR in the second of its four lessons.
+    calls = {"cqr": 50, "csp": 25}[method]
     with pytest.raises(InterruptedTrainingError):
         train(tmp_path / "run", tiny_config(head=CONFIGS[method]), stopping_after(calls, method))
     resumed = train(tmp_path / "run", tiny_config(head=CONFIGS[method]), ignore_progress)
@@ -226,7 +227,7 @@ def test_a_graph_that_differs_from_its_reference_is_not_published(runs, tmp_path
 
 
 @pytest.mark.parametrize(
-    "changes", [{"forest": "per_dof"}, {"residuals": "held_out"}, {"components": 0}]
+    "changes", [{"forest": "per_dof"}, {"residuals": "held_out", "components": 0}]
 )
 def test_other_forests_train_and_publish(tmp_path, changes):
     head = CqrConfig(trees=5, leaf_size=4, forest_copies=0, **changes)
