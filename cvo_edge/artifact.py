@@ -171,7 +171,8 @@ class SelfTest(_Strict, frozen=True):
 class Provenance(_Strict, frozen=True):
     """How the bundle was made: names and digests, never a path.
 
-    ``backbone`` is null for a given network that came as an ONNX file.
+    ``backbone`` and ``training_split`` are null for a given network that came as an ONNX file. The
+    split of the run stays when a bundle is calibrated anew: it says which frames are not new.
     """
 
     created_with: dict[Text, Text]
@@ -179,6 +180,7 @@ class Provenance(_Strict, frozen=True):
     backbone: Text | None
     weights_sha256: Sha256 | None
     dataset: Text
+    training_split: SplitSpec | None
     options: dict[Text, Text | int | float | bool | None]
 
 

@@ -61,20 +61,33 @@ def _details(calibration: Calibration) -> str:
 
 
 def _unbounded(calibration: Calibration) -> list[str]:
-    """Say how many frames or sequences the unbounded thresholds would need."""
-    source = calibration.calibration
+    """Say why thresholds are unbounded: how many frames or sequences they would need."""
+    if calibration.method not in HEADS:
+        return []
+    source, head = calibration.calibration, HEADS[calibration.method](calibration)
     unit, given = ("frames", source.n)
     if source.rule == "hierarchical":
         unit, given = ("sequences", source.n_sequences)
     lines = []
-    for confidence in calibration.confidences("marginal"):
-        entry = calibration.threshold(confidence, "marginal")
-        needed = math.ceil(confidence / (1.0 - confidence) - 1e-9)
-        if entry is not None and None in entry.q_hat and given < needed:
-            lines.append(
-                f"unbounded    at {confidence:g}: needs at least {needed} calibration {unit}, "
-                f"has {given}"
-            )
+    for entry in calibration.thresholds:
+        levels = head.side_confidences(entry.confidence)
+        if entry.scope == "joint" and source.joint == "bonferroni":
+            levels = head.side_confidences(1.0 - (1.0 - entry.confidence) / 6)
+        sides = [
+            (level, q_hat)
+            for level, q_hat in zip(levels, (entry.q_hat, entry.q_hat_upper), strict=False)
+            if level is not None and q_hat is not None and None in q_hat
+        ]
+        if not sides:
+            continue
+        level = max(level for level, _ in sides)
+        if entry.scope == "joint" and source.joint == "max":
+            level = entry.confidence
+        needed = math.ceil(level / (1.0 - level) - 1e-9)
+        reason = f"needs at least {needed} calibration {unit}, has {given}"
+        if given >= needed:
+            reason = "too many calibration truths lie outside the workspace of the classes"
+        lines.append(f"unbounded    at {entry.confidence:g} {entry.scope}: {reason}")
     return lines
 
 

@@ -107,6 +107,10 @@ class Chart:
         turns = ("roll", "pitch", "yaw") if self.rotation == "euler_zyx" else ("rx", "ry", "rz")
         return (*_TRANSLATION, *turns)
 
+    @property
+    def _about_prediction(self) -> bool:
+        return self.rotation == "tangent_predicted"
+
     def coordinates(self, pose: ArrayLike, predicted: ArrayLike) -> Array:
         """Six numbers of poses (..., 7) as seen from predictions (..., 7) -> (..., 6)."""
         p = np.asarray(pose, dtype=np.float64)
@@ -116,7 +120,9 @@ class Chart:
             turn = geometry.quaternion_to_euler_zyx(p[..., 3:])
             turn = at_origin + geometry.wrap_angle(turn - at_origin)
         else:
-            q_base = self.reference_q_xyzw if self.reference_q_xyzw is not None else origin[..., 3:]
+            q_base = self.reference_q_xyzw
+            if self._about_prediction or q_base is None:
+                q_base = origin[..., 3:]
             q_base_inverse = geometry.quaternion_conjugate(q_base)
             turn = geometry.quaternion_log(geometry.quaternion_multiply(q_base_inverse, p[..., 3:]))
         return np.concatenate(np.broadcast_arrays(p[..., :3], turn), axis=-1)
@@ -129,7 +135,7 @@ class Chart:
         if self.rotation == "euler_zyx":
             return self.coordinates(pose, pose)
         tx, ty, tz, x, y, z, w = pose.tolist()
-        if self.reference_q_xyzw is None:
+        if self._about_prediction or self.reference_q_xyzw is None:
             return np.array((tx, ty, tz, 0.0, 0.0, 0.0))
         a, b, c, d = self.reference_q_xyzw.tolist()
         # Vector and scalar part of conj(reference) * q; the log takes the shorter way round.
@@ -177,8 +183,9 @@ class ConformalSet:
 
     def within(self, lowest: Array, highest: Array) -> ConformalSet:
         """Return the set with its unbounded sides put at these limits, (6,) each."""
-        lower = np.where(np.isfinite(self.lower), self.lower, lowest)
-        upper = np.where(np.isfinite(self.upper), self.upper, highest)
+        # A finite side beyond the limit of the other one leaves a set without width.
+        lower = np.where(np.isfinite(self.lower), self.lower, np.minimum(lowest, self.upper))
+        upper = np.where(np.isfinite(self.upper), self.upper, np.maximum(highest, self.lower))
         bands = self.bands
         if bands is not None:
             bands = tuple(

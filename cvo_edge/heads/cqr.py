@@ -121,6 +121,14 @@ class CqrHead:
                 f"thresholds.q_hat_upper: expected {'null' if symmetric else 'six values'} with "
                 f"{sides} sides, found otherwise"
             )
+        for number, level in enumerate(self.side_confidences(0.9)):
+            side = "q_hat_upper" if number else "q_hat"
+            if level is None and any(
+                q is not None for t in calibration.thresholds for q in getattr(t, side) or ()
+            ):
+                raise CalibrationFileError(
+                    f"thresholds.{side}: expected null with {sides} sides, found numbers"
+                )
         smallest = min(q for t in calibration.thresholds for q in (*t.q_hat, 0.0) if q is not None)
         # The larger of two opposite scores is never negative.
         if symmetric and score != "additive" and smallest < 0.0:

@@ -123,7 +123,8 @@ class CspHead:
         q_hat = infinite_where_null(threshold.q_hat)
         inside = self._class_scores(probabilities)[0] <= q_hat[:, np.newaxis]
         inside &= ~self._unused
-        inside[np.arange(6), probabilities[0].argmax(axis=1)] = True
+        likeliest = np.where(self._unused, -1.0, probabilities[0]).argmax(axis=1)
+        inside[np.arange(6), likeliest] = True
         # Where membership changes, row by row: starts and ends take turns.
         framed = np.zeros((6, inside.shape[1] + 2), dtype=np.int8)
         framed[:, 1:-1] = inside

@@ -43,10 +43,10 @@ def check_target(bundle_dir: Path) -> None:
     """Raise SinkError where the folder holds something that is no bundle."""
     own = {artifact.CALIBRATION_FILE, artifact.MODEL_FILE}
     if bundle_dir.exists() and not (
-        bundle_dir.is_dir() and {path.name for path in bundle_dir.iterdir()} == own
+        bundle_dir.is_dir() and {path.name for path in bundle_dir.iterdir()} in (own, set())
     ):
         raise SinkError(
-            f"{bundle_dir}: expected a new folder or a bundle to replace, found another"
+            f"{bundle_dir}: expected a new folder or a bundle to replace, found other files"
         )
 
 

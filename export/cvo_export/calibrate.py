@@ -27,7 +27,7 @@ from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.heads.cqr import Sides
 from cvo_edge.odometer import Observation, Odometer
-from cvo_edge.pose import Scope
+from cvo_edge.pose import ConformalSet, Scope
 from cvo_edge.selftest import observe_selftest
 from cvo_export.datasets import PoseDataset
 
@@ -65,6 +65,17 @@ class Observed:
     true_pose: Array
     sequence: NDArray[np.int64]
     flagged: int
+
+    def regions(self, head: Head, entry: Threshold) -> list[ConformalSet]:
+        """Return the set of every frame at a threshold."""
+        return [
+            head.region(
+                {name: values[row : row + 1] for name, values in self.outputs.items()},
+                point,
+                entry,
+            )
+            for row, point in enumerate(self.point)
+        ]
 
 
 def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]) -> Observed:
@@ -162,11 +173,15 @@ def selected(
     if score is not None and score not in names:
         raise UsageError(f"score: expected one of {', '.join(names)}, found {score}")
     kept = [c for c in candidates if score in (None, c.score)]
-    if sides is None:
+    if sides is None or (sides == "symmetric" and "sides" not in _names(kept[0])):
         return tuple(kept)
-    if any("sides" not in c.parameters.__struct_fields__ for c in kept):
+    if any("sides" not in _names(candidate) for candidate in kept):
         raise UsageError(f"sides: expected symmetric, as the method has no others, found {sides}")
     return tuple(c._replace(parameters=replace(c.parameters, sides=sides)) for c in kept)
+
+
+def _names(candidate: Candidate) -> tuple[str, ...]:
+    return candidate.parameters.__struct_fields__
 
 
 def with_candidate(draft: Calibration, candidate: Candidate) -> Calibration:
@@ -203,12 +218,8 @@ def chosen(draft: Calibration, val: Observed, candidates: Sequence[Candidate]) -
         head = HEADS[calibration.method](calibration)
         scores = head.scores(val.outputs, val.point, val.truth)
         entry = _threshold(0.9, "marginal", marginal_thresholds(head, scores, 0.9, _pooled))
-        regions = [
-            head.region({k: v[row : row + 1] for k, v in val.outputs.items()}, point, entry).within(
-                *workspace(calibration)
-            )
-            for row, point in enumerate(val.point)
-        ]
+        limits = workspace(calibration)
+        regions = [region.within(*limits) for region in val.regions(head, entry)]
         width = np.array([region.width() for region in regions])
         distance = np.array([r.distance(y) for r, y in zip(regions, val.truth, strict=True)])
         deviation = np.array(calibration.pose.standard_deviation)

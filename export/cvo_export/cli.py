@@ -252,7 +252,8 @@ def train(
         int | None, typer.Option(min=0, help="cqr: augmented copies among the forest's rows.")
     ] = None,
     classes: Annotated[
-        int | None, typer.Option(min=2, help="csp: K, classes of each degree of freedom.")
+        int | None,
+        typer.Option(min=2, max=256, help="csp: K, classes of each degree of freedom, 128."),
     ] = None,
     labels: Annotated[
         LabelsName | None, typer.Option(help="csp: ordinal by default; one_hot: the paper's.")
@@ -320,10 +321,11 @@ RuleOption = Annotated[
 JointOption = Annotated[JointName, typer.Option(help="How the joint scope is made.")]
 ScoreOption = Annotated[
     str | None,
-    typer.Option(help="cjp, cqr: normalised, additive; csp: aps, lac, raps. val decides."),
+    typer.Option(help="cjp, cqr: normalised, additive; csp: aps, lac, raps; val decides."),
 ]
 SidesOption = Annotated[
-    SidesName | None, typer.Option(help="cqr: symmetric by default; which bounds are calibrated.")
+    SidesName | None,
+    typer.Option(help="cqr: which bounds are calibrated; symmetric in a new bundle."),
 ]
 NameOption = Annotated[str | None, typer.Option(help="The folder's name by default.")]
 
@@ -369,15 +371,22 @@ def calibrate(
         SplitName | None,
         typer.Option(help="sequence where there are three or more, else block."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Decides the split.")] = 0,
+    seed: Annotated[int | None, typer.Option(min=0, help="Decides the split; 0.")] = None,
     rule: RuleOption = None,
     joint: JointOption = JointName.MAX,
     score: ScoreOption = None,
     sides: SidesOption = None,
     rotation: Annotated[
-        RotationName, typer.Option(help="ONNX file: chart of its bounds.")
-    ] = RotationName.TANGENT_PREDICTED,
-    crop: Annotated[CropName, typer.Option(help="ONNX file: what it sees.")] = CropName.NONE,
+        RotationName | None,
+        typer.Option(help="ONNX file: chart of its bounds; tangent_predicted by default."),
+    ] = None,
+    crop: Annotated[
+        CropName | None, typer.Option(help="ONNX file: what it sees; none by default.")
+    ] = None,
+    new_data: Annotated[
+        bool,
+        typer.Option("--new-data", help="Bundle: the data are new, though of the same name."),
+    ] = False,
     name: NameOption = None,
 ) -> None:
     """Calibrate a network that is there, on data that it has not seen: your own, or a bundle's.
@@ -400,8 +409,9 @@ def calibrate(
         joint=joint.value,
         score=score,
         sides=sides.value if sides else None,
-        rotation=rotation.value,
-        crop=crop.value,
+        rotation=rotation.value if rotation else None,
+        crop=crop.value if crop else None,
+        new_data=new_data,
     )
     print(*inspect_lines(calibration), sep="\n")
 

@@ -46,7 +46,7 @@ def evaluate(
     recorded = calibration.calibration.split
     first = calibration.thresholds[0]
     split = same_split(dataset, recorded) if subset == "test" else None
-    indices = split.roles["test"] if split else np.arange(len(dataset))
+    indices = subset_indices(calibration, dataset, subset)
     with Odometer(
         bundle, threads=threads, confidence=first.confidence, scope=first.scope
     ) as odometer:
@@ -69,6 +69,8 @@ def evaluate(
                 "invalid": seen.flagged,
             },
             "n_calibration": calibration.calibration.n,
+            # Then "all" may hold frames that the network was trained on.
+            "named_as_training_data": dataset.name == calibration.provenance.dataset,
             "point_error": point_error(seen),
             "levels": levels,
             "sequences": sets.sequences(dataset),
@@ -154,6 +156,8 @@ def table(report: Mapping[str, Any]) -> list[str]:
         f"point error  median {100 * error['median_m']:.2f} cm {error['median_deg']:.2f} deg, "
         f"90 % {100 * error['p90_m']:.2f} cm {error['p90_deg']:.2f} deg",
     ]
+    if report["subset"] == "all" and report["named_as_training_data"]:
+        lines.append("the name is that of the training data: true only if no frame is of it")
     lines += _level_lines(report["rule"], report["levels"])
     if "other_rule" in report:
         lines += _level_lines(report["other_rule"]["rule"], report["other_rule"]["levels"])
@@ -228,24 +232,13 @@ class _Sets:
     def calibration(self) -> Calibration:
         return self.odometer.calibration
 
-    def regions(self, entry: Threshold) -> list[ConformalSet]:
-        """Return the set of every frame."""
-        return [
-            self.odometer.head.region(
-                {name: values[row : row + 1] for name, values in self.seen.outputs.items()},
-                point,
-                entry,
-            )
-            for row, point in enumerate(self.seen.point)
-        ]
-
     def covered(self, regions: list[ConformalSet]) -> NDArray[np.bool_]:
         """Which true numbers lie in these sets, (n, 6)."""
         return np.array([r.covers(y) for r, y in zip(regions, self.seen.truth, strict=True)])
 
     def level(self, entry: Threshold) -> dict[str, Any]:
         """Return the report's entry for one threshold."""
-        regions = self.regions(entry)
+        regions = self.seen.regions(self.odometer.head, entry)
         covered = self.covered(regions)
         bounded = np.array([np.isfinite((r.lower, r.upper)).all() for r in regions])
         limits = workspace(self.calibration)
@@ -253,7 +246,11 @@ class _Sets:
         width = np.array([region.width() for region in limited])
         distance = np.array([r.distance(y) for r, y in zip(limited, self.seen.truth, strict=True)])
         n, n_test = self.calibration.calibration.n, len(covered)
-        score = interval_score(width, distance, 1.0 - entry.confidence)
+        used = [level for level in self.odometer.head.side_confidences(0.9) if level is not None]
+        one_bound = len(used) < len(self.odometer.head.side_confidences(0.9))
+        # A single bound is penalised by 1/alpha, an interval by 2/alpha.
+        alpha = (1.0 - entry.confidence) * (2.0 if one_bound else 1.0)
+        score = interval_score(width, distance, alpha)
         deviation = np.array(self.calibration.pose.standard_deviation)
         nonconformity = self.odometer.head.scores(
             self.seen.outputs, self.seen.point, self.seen.truth
@@ -263,8 +260,8 @@ class _Sets:
         # sequences, of two thresholds a set, or of six that hold together by Bonferroni.
         finite = (
             self.rule == "pooled"
-            and entry.q_hat_upper is None
-            and all(q is not None for q in entry.q_hat)
+            and len(used) == 1
+            and any(None not in side for side in (entry.q_hat, entry.q_hat_upper or (None,)))
             and (entry.scope, self.calibration.calibration.joint) != ("joint", "bonferroni")
         )
         return {
@@ -308,8 +305,9 @@ class _Sets:
         joint = self.calibration.threshold(0.9, "joint")
         if marginal is None or joint is None:
             return {}
-        covered = self.covered(self.regions(marginal))
-        jointly = np.asarray(self.covered(self.regions(joint)).all(axis=1))
+        head = self.odometer.head
+        covered = self.covered(self.seen.regions(head, marginal))
+        jointly = np.asarray(self.covered(self.seen.regions(head, joint)).all(axis=1))
         found = {}
         for number in np.unique(self.seen.sequence).tolist():
             rows = np.flatnonzero(np.equal(self.seen.sequence, number))

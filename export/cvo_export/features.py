@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from tempfile import NamedTemporaryFile
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from cvo_edge import preprocess
-from cvo_edge.errors import SourceError
+from cvo_edge.errors import SinkError, SourceError
 from cvo_edge.session import Session, allowed_cores
 from cvo_export.augment import AugmentConfig, augmented, model_intrinsics
 from cvo_export.backbone import Backbone
@@ -84,22 +86,39 @@ def cached_copies(
 
     One file a copy, written whole or not at all, so that an interrupted run goes on with the next.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     features, poses = [], []
     for number in range(copies + 1):
         path = folder / f"copy-{number:03d}.npz"
-        if not path.is_file():
+        found = _stored_copy(path, len(images))
+        if found is None:
             graded = config.graded(number / max(1, copies))
             found = _one_copy(images, extractor, graded, (seed, number))
-            partial = path.with_suffix(".partial")
-            with partial.open("wb") as stream:
-                np.savez(stream, features=found[0], poses=found[1])
-            partial.replace(path)
-        with np.load(path) as stored:
-            features.append(stored["features"])
-            poses.append(stored["poses"])
+            _store_copy(path, found)
+        features.append(found[0])
+        poses.append(found[1])
         progress("features", number + 1, copies + 1)
     return np.stack(features), np.stack(poses)
+
+
+def _stored_copy(path: Path, count: int) -> tuple[NDArray[np.float16], Array] | None:
+    """Features and poses of a copy, or None where there are none, or no whole ones."""
+    try:
+        with np.load(path) as stored:
+            features, poses = stored["features"], stored["poses"]
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return None
+    return (features, poses) if len(features) == len(poses) == count else None
+
+
+def _store_copy(path: Path, copy: tuple[NDArray[np.float16], Array]) -> None:
+    """Write a copy under a name of its own first: another run may be writing the same one."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with NamedTemporaryFile(dir=path.parent, suffix=".partial", delete=False) as stream:
+            np.savez(stream, features=copy[0], poses=copy[1])
+        Path(stream.name).replace(path)
+    except OSError as error:
+        raise SinkError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def _one_copy(

@@ -50,11 +50,15 @@ def plot(
         The picture cannot be written.
     """
     try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
         raise UsageError(
             'plot: expected matplotlib, found none; pip install "cvo-export[plot]"'
         ) from None
+    known = FigureCanvasAgg(Figure()).get_supported_filetypes()
+    if out.suffix[1:].lower() not in known or out.is_dir():
+        raise UsageError(f"out: expected a file .{', .'.join(sorted(known))}, found {out}")
     with Odometer.load(bundle_dir, confidence=confidence, scope=scope) as odometer:
         indices = subset_indices(odometer.calibration, dataset, subset)
         if sequence is not None:
@@ -82,10 +86,13 @@ def plot(
             f"{confidence:g} {scope}, {len(rows)} frames of {dataset.name}"
             + (f", {sequence}" if sequence else "")
         )
+    partial = out.with_name(f".partial-{out.name}")
     try:
-        figure.savefig(out, dpi=_DPI)
-    except (OSError, ValueError) as error:
-        raise SinkError(f"{out}: cannot be written: {error}") from None
+        figure.savefig(partial, dpi=_DPI)
+        partial.replace(out)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise SinkError(f"{out}: cannot be written: {error.strerror}") from None
 
 
 def _step(odometer: Odometer, dataset: PoseDataset, index: int) -> PoseInterval:

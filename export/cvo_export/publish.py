@@ -164,7 +164,12 @@ def _draft(
             backbone=config.backbone.name,
             weights_sha256=run.weights_sha256,
             dataset=run.dataset.name,
-            options={**_options(run), "parity": float(f"{parity:.3g}")},
+            training_split=run.split.spec(run.dataset),
+            options={
+                **_options(run),
+                "lesson": run.best.lesson,
+                "parity": float(f"{parity:.3g}"),
+            },
         ),
         digest="0" * 64,
     )

@@ -22,6 +22,7 @@ from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageE
 from cvo_edge.geometry import mean_rotation
 from cvo_edge.heads import HEADS
 from cvo_edge.heads.cqr import CqrParameters, Sides
+from cvo_edge.heads.csp import CspParameters
 from cvo_edge.preprocess import Crop
 from cvo_export.bundle import (
     CAMERA_FRAME,
@@ -47,6 +48,9 @@ GivenRotation = Literal["tangent_predicted", "euler_zyx"]
 
 _FORMS = ({"pose": (1, 7)}, {"pose": (1, 7), "lower": (1, 6), "upper": (1, 6)})
 _FULL_TURN = float(np.pi)
+_LEAST_INPUT = 16
+# Of the raps score, where a bundle has none of its own.
+_PENALTY, _FREE_RANKS = 0.01, 5
 
 
 def recalibrate(
@@ -56,21 +60,24 @@ def recalibrate(
     name: str,
     *,
     kind: Kind | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     rule: Rule | None = None,
     joint: Joint = "max",
     score: str | None = None,
     sides: Sides | None = None,
-    rotation: GivenRotation = "tangent_predicted",
-    crop: Crop = "none",
+    rotation: GivenRotation | None = None,
+    crop: Crop | None = None,
+    new_data: bool = False,
 ) -> Calibration:
     """Calibrate a model file or the model of a bundle on a data set and write the new bundle.
 
     The data set is one that the network has not been trained on: a tenth of it (role ``val``)
     decides between scores and compares degrees of freedom, a fifth (``test``) is left for
-    ``evaluate``, the rest gives the thresholds. Where it is the very data set that the bundle's run
-    was split from, that run's own ``val`` and ``cal`` are used. ``rotation`` and ``crop`` describe
-    a model file.
+    ``evaluate``, the rest gives the thresholds; of a data set with a test list of its own that
+    list alone is taken. Where it is the very data set that the bundle's run was split from, that
+    run's own ``val`` and ``cal`` are used. ``rotation`` (None: ``tangent_predicted``) and ``crop``
+    (None: ``none``) describe a model file. ``new_data`` says that a data set of the training data's
+    name holds none of its frames.
 
     Raises
     ------
@@ -79,21 +86,28 @@ def recalibrate(
     CalibrationFileError
         The folder is no bundle.
     SourceError, UsageError
-        The data set is too small or its frames do not pass the checks.
+        The data set is too small, its frames do not pass the checks, or they may be those that the
+        network was trained on; or an option that has no meaning here.
     SinkError
         The new folder cannot be written.
     """
     check_target(bundle_dir)
     if model.is_dir():
+        if rotation is not None or crop is not None:
+            raise UsageError("rotation, crop: expected with an ONNX file, found with a bundle")
         bundle = read_bundle(model)
-        split = _split_of(bundle.calibration, dataset, kind, seed)
-        draft = _with_wider_limits(bundle.calibration, dataset.poses[_known(split)])
+        split = _split_of(bundle.calibration, dataset, kind, seed, new_data)
+        draft = bundle.calibration
+        if split.purpose == "calibration":
+            draft = _with_wider_limits(draft, dataset.poses[split.roles["val"]])
         model_bytes = bundle.model_bytes
         candidates = _own_candidates(bundle.calibration)
     else:
         model_bytes = _read_model(model)
         split = _new_split(dataset, kind, seed)
-        draft = _from_model(model_bytes, dataset, split, name, rotation, crop)
+        draft = _from_model(
+            model_bytes, dataset, split, name, rotation or "tangent_predicted", crop or "none"
+        )
         candidates = _given_candidates(draft)
     if rule is None:
         rule = "hierarchical" if split.kind == "sequence" else "pooled"
@@ -107,22 +121,36 @@ def recalibrate(
 
 
 def _split_of(
-    calibration: Calibration, dataset: PoseDataset, kind: Kind | None, seed: int
+    calibration: Calibration,
+    dataset: PoseDataset,
+    kind: Kind | None,
+    seed: int | None,
+    new_data: bool,
 ) -> Split:
     """The run's own split where the data set is the run's, else one of frames new to it."""
-    try:
-        return same_split(dataset, calibration.calibration.split)
-    except (SourceError, UsageError):
+    trained_on, name = calibration.provenance.training_split, calibration.provenance.dataset
+    if trained_on is None:
         return _new_split(dataset, kind, seed)
+    try:
+        split = same_split(dataset, trained_on)
+    except (SourceError, UsageError):
+        if dataset.name == name and not new_data:
+            raise UsageError(
+                f"data set: expected frames that the network was not trained on, found other "
+                f"frames of the training data's name, {name}; --new-data says that they are new"
+            ) from None
+        return _new_split(dataset, kind, seed)
+    if kind is not None or seed is not None:
+        raise UsageError(
+            "split, seed: expected none on the data set that the bundle was trained on, whose own "
+            "roles are used, found some"
+        )
+    return split
 
 
-def _new_split(dataset: PoseDataset, kind: Kind | None, seed: int) -> Split:
-    return make_split(dataset, kind or default_kind(dataset, "calibration"), seed, "calibration")
-
-
-def _known(split: Split) -> NDArray[np.int64]:
-    """Frames whose poses may be looked at: all but test."""
-    return np.concatenate([split.roles["val"], split.roles["cal"]])
+def _new_split(dataset: PoseDataset, kind: Kind | None, seed: int | None) -> Split:
+    kind = kind or default_kind(dataset, "calibration")
+    return make_split(dataset, kind, seed or 0, "calibration")
 
 
 def _read_model(path: Path) -> bytes:
@@ -164,7 +192,12 @@ def _from_model(
                 f"{t.name} {t.dtype} {list(t.shape)}" for t in (*spec.inputs, *spec.outputs)
             )
         )
-    reference, limits, deviation = known_space(dataset.poses[_known(split)])
+    if min(shape[1:3]) < _LEAST_INPUT:
+        raise BundleMismatchError(
+            f"model: expected an input of at least {_LEAST_INPUT}x{_LEAST_INPUT} pixels, found "
+            f"{shape[2]}x{shape[1]}"
+        )
+    reference, limits, deviation = known_space(dataset.poses[split.roles["val"]])
     if rotation == "euler_zyx" or reference is None:
         reference, limits = None, _with_any_rotation(limits)
     return Calibration(
@@ -212,14 +245,11 @@ def _from_model(
             backbone=None,
             weights_sha256=None,
             dataset=dataset.name,
+            training_split=None,
             options={},
         ),
         digest="0" * 64,
     )
-
-
-def _shown(tensor: artifact.TensorSpec) -> str:
-    return f"{tensor.name} {tensor.dtype} {list(tensor.shape)}"
 
 
 def _fields(tensor: artifact.TensorSpec) -> dict[str, object]:
@@ -261,7 +291,18 @@ def _own_candidates(calibration: Calibration) -> tuple[Candidate, ...]:
     """A bundle's own score first, then what else its method could use with these parameters."""
     head = HEADS[calibration.method]
     parameters = calibration.parameters(head.parameters_type)
-    own = calibration.calibration.score
-    families = (("normalised", "additive"), ("aps", "lac"))
-    others = next((family for family in families if own in family), ())
-    return tuple(Candidate(score, parameters) for score in dict.fromkeys((own, *others)))
+    own = Candidate(calibration.calibration.score, parameters)
+    if isinstance(parameters, CspParameters):
+        raps = parameters
+        if parameters.penalty == 0.0:
+            raps = replace(parameters, penalty=_PENALTY, free_ranks=_FREE_RANKS)
+        family: tuple[Candidate, ...] = (
+            Candidate("aps", parameters),
+            Candidate("lac", parameters),
+            Candidate("raps", raps),
+        )
+    elif own.score == "residual":
+        family = (own,)
+    else:
+        family = (Candidate("normalised", parameters), Candidate("additive", parameters))
+    return (own, *(other for other in family if other.score != own.score))

@@ -130,15 +130,23 @@ class Run:
         )
         partial.replace(run_dir / NETWORK_FILE)
 
+    @property
+    def best(self) -> History:
+        """The evaluation of the weights that were kept, of all networks that val chose among.
+
+        Networks of other folds are no candidates.
+        """
+        last_phase = max(entry.phase for entry in self.history)
+        return min(
+            (e for e in self.history if e.phase == last_phase and "-fold" not in e.lesson),
+            key=lambda entry: entry.val_score,
+        )
+
     def lines(self) -> list[str]:
         """Return what was trained as lines of text for a person."""
         counts = ", ".join(f"{role} {indices.size}" for role, indices in self.split.roles.items())
         skipped = ", ".join(f"{count} {reason}" for reason, count in self.dataset.skipped.items())
-        last = self.history[-1]
-        best = min(
-            (e for e in self.history if (e.lesson, e.phase) == (last.lesson, last.phase)),
-            key=lambda entry: entry.val_score,
-        )
+        best = self.best
         parameters = sum(parameter.numel() for parameter in self.graph.parameters())
         return [
             f"data set    {self.dataset.name}: {len(self.dataset)} frames, {skipped or 'none'} "

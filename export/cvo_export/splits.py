@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -50,9 +50,14 @@ class Split:
     roles: Mapping[str, Indices]
 
     def digest(self, dataset: PoseDataset) -> str:
-        """sha256 over the roles' frame names: the same split of the same frames, or not."""
-        text = json.dumps(self._names(dataset), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
+        """sha256 over the roles' frame names and poses: the same split of the same frames, or not.
+
+        Poses to a tenth of a millimetre and milliradian: how a reader rounds does not matter.
+        """
+        digest = hashlib.sha256(json.dumps(self._names(dataset), sort_keys=True).encode())
+        for role in sorted(self.roles):
+            digest.update(np.round(dataset.poses[self.roles[role]] * 1e4).astype("<i8").tobytes())
+        return digest.hexdigest()
 
     def spec(self, dataset: PoseDataset) -> SplitSpec:
         """Return what a bundle says of it."""
@@ -87,29 +92,40 @@ def make_split(dataset: PoseDataset, kind: Kind, seed: int, purpose: Purpose = "
 
     ``random``: frames, exchangeable by construction but flattering on video; ``block``: 20
     contiguous blocks with gaps where roles change; ``sequence``: whole sequences, the data set's
-    own test list respected. The same data set and arguments give the same split.
+    own test list respected. The same data set and arguments give the same split. For calibration
+    the frames of a data set's own test list are dealt, where it has one: those of its training list
+    are what networks are trained on.
 
     Raises UsageError where the data set is too small for the kind.
     """
     generator = np.random.default_rng(seed)
+    frames = np.arange(len(dataset))
+    dealt = dataset
+    if purpose == "calibration" and dataset.own_test:
+        frames = np.flatnonzero(np.isin(dataset.sequence, sorted(dataset.own_test)))
+        dealt = _part(dataset, frames)
     if kind == "random":
-        roles = _random(dataset, generator, SHARES[purpose])
+        roles = _random(dealt, generator, SHARES[purpose])
     elif kind == "block":
-        roles = _block(dataset, generator, SHARES[purpose])
+        roles = _block(dealt, generator, SHARES[purpose])
     else:
-        roles = _sequence(dataset, generator, SHARES[purpose])
+        roles = _sequence(dealt, generator, SHARES[purpose])
+    roles = {role: frames[indices] for role, indices in roles.items()}
     empty = [role for role, indices in roles.items() if indices.size == 0]
     if empty:
         raise UsageError(
             f"split {kind}: expected frames for every role, found none for {', '.join(empty)} "
-            f"among {len(dataset)} frames of {len(dataset.sequence_names)} sequence(s)"
+            f"among {frames.size} frames of {np.unique(dealt.sequence).size} sequence(s)"
         )
     return Split(kind, seed, purpose, roles)
 
 
 def default_kind(dataset: PoseDataset, purpose: Purpose = "training") -> Kind:
     """Return ``sequence`` where there are enough sequences for the roles, else ``block``."""
-    return "sequence" if len(dataset.sequence_names) >= len(SHARES[purpose]) else "block"
+    sequences = len(dataset.sequence_names)
+    if purpose == "calibration" and dataset.own_test:
+        sequences = len(dataset.own_test)
+    return "sequence" if sequences >= len(SHARES[purpose]) else "block"
 
 
 def same_split(dataset: PoseDataset, recorded: SplitSpec) -> Split:
@@ -155,6 +171,18 @@ def _counts(total: int, shares: Mapping[str, float]) -> dict[str, int]:
             counts[max(counts, key=lambda role: counts[role])] -= 1
             counts[min(counts, key=lambda role: counts[role])] += 1
     return counts
+
+
+def _part(dataset: PoseDataset, frames: Indices) -> PoseDataset:
+    """These frames of a data set, without lists of its own; frame numbers begin at 0 again."""
+    return replace(
+        dataset,
+        poses=dataset.poses[frames],
+        sequence=dataset.sequence[frames],
+        frame_names=tuple(dataset.frame_names[index] for index in frames.tolist()),
+        own_train=frozenset(),
+        own_test=frozenset(),
+    )
 
 
 def _deal(items: Indices, counts: Mapping[str, int]) -> dict[str, Indices]:
@@ -209,7 +237,7 @@ def _border(
 def _sequence(
     dataset: PoseDataset, generator: np.random.Generator, shares: Mapping[str, float]
 ) -> dict[str, Indices]:
-    everything = range(len(dataset.sequence_names))
+    everything = np.unique(dataset.sequence).tolist()
     test = np.array(sorted(dataset.own_test), dtype=np.int64)
     pool = sorted((dataset.own_train or frozenset(everything)) - dataset.own_test)
     shuffled = generator.permutation(np.array(pool, dtype=np.int64))

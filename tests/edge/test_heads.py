@@ -100,6 +100,7 @@ def test_a_set_emptied_by_a_negative_threshold_is_its_middle():
         ("cqr", "additive", {"half_width_floor": FLOOR, "sides": "lower"}, None, "six values"),
         ("cqr", "additive", {"half_width_floor": FLOOR, "sides": "symmetric"}, (0.1,) * 6, "null"),
         ("cqr", "additive", {"half_width_floor": FLOOR}, None, "sides"),
+        ("cqr", "additive", {"half_width_floor": FLOOR, "sides": "lower"}, (0.1,) * 6, "null with"),
     ],
 )
 def test_parameters_that_do_not_fit_are_refused(
@@ -239,6 +240,14 @@ def test_aps_of_the_last_ranked_class_is_the_whole_mass():
 def test_class_parameters_that_do_not_fit_are_refused(make_head, change, match):
     with pytest.raises(CalibrationFileError, match=match):
         make_head("csp", "aps", {**parameters(), **change})
+
+
+def test_an_unused_class_is_never_the_likeliest(make_head):
+    head = make_head("csp", "aps", parameters())
+    outputs = probabilities(0)
+    outputs["probabilities"][0, 1] = [0.1, 0.2, 0.7, 0.0, 0.0]  # a DoF of two classes
+    region = head.region(outputs, np.zeros(6), threshold([0.0] * 6))
+    assert region.bands[1] == ((0.0, 2.0),)
 
 
 def test_a_score_or_a_side_of_another_method_is_refused(make_head):

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from cvo_edge import Odometer
-from cvo_edge.artifact import read_bundle, read_calibration
+from cvo_edge.artifact import Threshold, read_bundle, read_calibration
+from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_edge.errors import GateError, UsageError
 from cvo_edge.session import Session
 from cvo_edge.sinks import Sink
@@ -18,7 +19,7 @@ from cvo_export.calibrate import observe
 from cvo_export.configure import configure
 from cvo_export.evaluate import evaluate, find_level, table
 from cvo_export.heads.cqr import CqrConfig
-from cvo_export.heads.csp import Classes, CspConfig, CspLearner, best_temperatures
+from cvo_export.heads.csp import Classes, CspConfig, CspLearner, best_temperatures, set_score
 from cvo_export.plot import plot
 from cvo_export.publish import publish
 from cvo_export.run import load_run
@@ -153,6 +154,9 @@ def test_a_picture_is_drawn(runs, method, tmp_path):
     _, run, bundle = runs(method)
     plot(bundle, run.dataset, tmp_path / "bands.png", scope="joint", confidence=0.8)
     assert (tmp_path / "bands.png").read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in tmp_path.iterdir()] == ["bands.png"]
+    with pytest.raises(UsageError, match="out: expected a file"):
+        plot(bundle, run.dataset, tmp_path / "bands.xyz")
     with pytest.raises(UsageError, match="sequence: expected one of"):
         plot(bundle, run.dataset, tmp_path / "other.png", sequence="no such")
 
@@ -371,6 +375,42 @@ def test_a_degree_of_freedom_that_repeats_has_fewer_classes():
     assert (labels[:, 2][:, ~classes.used[2]] == 0).all()
     probabilities = torch.softmax(learner.network.eval()(torch.zeros(3, 4)), dim=-1)
     assert (probabilities[:, 2][:, ~classes.used[2]] == 0).all()
+
+
+def test_fewer_poses_than_classes_leave_no_class_without_a_place():
+    generator = np.random.default_rng(0)
+    still = generator.standard_normal((260, 6))
+    still[:160] = still[0]  # a camera at rest
+    for y in (generator.standard_normal((60, 6)), still, np.repeat(still[150:170], 10, axis=0)):
+        classes = Classes.cut(y, 128)
+        medians, edges = classes.medians.numpy(), classes.edges.numpy()
+        used = classes.used.numpy()
+        assert np.isfinite(medians).all()
+        assert ((edges[:, :-1] <= medians) & (medians <= edges[:, 1:]))[used].all()
+
+
+def test_what_val_judges_is_what_the_runtime_gives(runs):
+    _, run, bundle = runs("csp")
+    classes, target = run.graph.head.network.classes, run.target
+    with Odometer.load(bundle) as odometer:
+        seen = observe(odometer, run.dataset, run.split.roles["val"])
+        head = odometer.head
+    scores = head.scores(seen.outputs, seen.point, seen.truth)
+    q_hat = [conformal_quantile(scores[:, 0, dof], 0.9) for dof in range(6)]
+    entry = Threshold(confidence=0.9, scope="marginal", q_hat=tuple(q_hat), q_hat_upper=None)
+    regions = seen.regions(head, entry)
+    width = np.array([region.width() for region in regions])
+    distance = np.array([r.distance(y) for r, y in zip(regions, seen.truth, strict=True)])
+    expected = interval_score(width, distance, 0.1) / target.std
+    y = (seen.truth - target.mean) / target.std
+    found = set_score(classes, seen.outputs["probabilities"].astype(np.float64), y)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_the_network_that_val_chose_is_named_in_the_bundle(runs):
+    _, run, bundle = runs("csp")
+    assert read_calibration(bundle).provenance.options["lesson"] == run.best.lesson
+    assert run.best.val_score == min(entry.val_score for entry in run.history)
 
 
 def test_position_counts_classes_from_middle_to_middle():

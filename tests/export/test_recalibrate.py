@@ -125,13 +125,29 @@ def test_few_frames_are_unbounded_and_said_to_be(model_file, tmp_path):
     assert calibration.threshold(0.8, "marginal").q_hat != (None,) * 6
     assert calibration.threshold(0.9, "marginal").q_hat == (None,) * 6
     lines = inspect_lines(calibration)
-    assert "unbounded    at 0.9: needs at least 9 calibration frames, has 8" in lines
-    assert "unbounded    at 0.99: needs at least 99 calibration frames, has 8" in lines
+    for scope in ("marginal", "joint"):
+        for confidence, needed in ((0.9, 9), (0.95, 19), (0.99, 99)):
+            said = f"needs at least {needed} calibration frames, has 8"
+            assert f"unbounded    at {confidence} {scope}: {said}" in lines
+
+
+def test_what_two_sides_and_bonferroni_would_need_is_said(model_file, dataset, tmp_path):
+    lines = inspect_lines(
+        recalibrate(
+            *(model_file, dataset, tmp_path / "b", "own"),
+            kind="random",
+            sides="asymmetric",
+            joint="bonferroni",
+        )
+    )
+    # 168 frames: each side at 0.995 needs 199; at a sixth of 0.05, half a side, 239.
+    assert "unbounded    at 0.99 marginal: needs at least 199 calibration frames, has 168" in lines
+    assert "unbounded    at 0.95 joint: needs at least 239 calibration frames, has 168" in lines
 
 
 def test_a_bundle_keeps_its_model_and_method_on_new_data(tiny_bundle, dataset, tmp_path):
     before = read_bundle(tiny_bundle)
-    recalibrate(tiny_bundle, dataset, tmp_path / "b", "new site", kind="random")
+    recalibrate(tiny_bundle, dataset, tmp_path / "b", "new site", kind="random", new_data=True)
     after = read_bundle(tmp_path / "b")
     assert after.model_bytes == before.model_bytes
     assert after.calibration.method == before.calibration.method
@@ -154,6 +170,37 @@ def test_on_the_runs_own_data_the_frames_it_trained_on_stay_out(tiny_bundle, tin
     )
     assert after.thresholds == before.thresholds
     assert after.calibration.split == before.calibration.split
+
+
+def test_other_frames_of_the_training_datas_name_need_a_word(tiny_bundle, tmp_path):
+    # Eight of the nine flights are those that the network was trained on.
+    superset = open_dataset("synthetic:room,flights=9,frames=40,size=64x48")
+    with pytest.raises(UsageError, match="--new-data"):
+        recalibrate(tiny_bundle, superset, tmp_path / "b", "leak", kind="random")
+    assert not (tmp_path / "b").exists()
+
+
+def test_the_run_is_remembered_when_a_bundle_comes_back_to_its_own_data(
+    tiny_bundle, tiny_run, dataset, tmp_path
+):
+    before = read_calibration(tiny_bundle)
+    recalibrate(tiny_bundle, dataset, tmp_path / "b", "away", kind="random", new_data=True)
+    after = recalibrate(
+        tmp_path / "b", tiny_run.dataset, tmp_path / "c", "home", score=before.calibration.score
+    )
+    assert after.calibration.split == before.calibration.split
+    assert after.calibration.n == before.calibration.n
+
+
+@pytest.mark.parametrize("given", [{"rotation": "euler_zyx"}, {"crop": "centre"}])
+def test_options_of_a_model_file_are_refused_with_a_bundle(tiny_bundle, dataset, tmp_path, given):
+    with pytest.raises(UsageError, match="expected with an ONNX file"):
+        recalibrate(tiny_bundle, dataset, tmp_path / "b", "b", **given)
+
+
+def test_a_split_is_not_asked_for_on_the_runs_own_data(tiny_bundle, tiny_run, tmp_path):
+    with pytest.raises(UsageError, match="whose own roles are used"):
+        recalibrate(tiny_bundle, tiny_run.dataset, tmp_path / "b", "b", kind="random")
 
 
 def test_a_network_is_calibrated_where_torch_is_not_installed(model_file, tmp_path):
@@ -183,6 +230,7 @@ def test_a_network_is_calibrated_where_torch_is_not_installed(model_file, tmp_pa
         (None, ModelError, "expected an ONNX file or a bundle folder"),
         ({"outputs": ("place", "lower", "upper")}, BundleMismatchError, "pose"),
         ({"outputs": ("pose", "low", "high")}, BundleMismatchError, "found image uint8"),
+        ({"height": 8, "width": 8}, BundleMismatchError, "at least 16x16 pixels, found 8x8"),
     ],
 )
 def test_what_is_no_such_model_is_refused(dataset, tmp_path, content, error, match):

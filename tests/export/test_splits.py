@@ -1,5 +1,7 @@
 """No frame has two roles; gaps, shares, sequences and digests."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -119,6 +121,23 @@ def test_another_data_set_is_not_taken_for_the_recorded_one():
     recorded = make_split(made, "random", 0).spec(made)
     with pytest.raises(SourceError, match="another data set"):
         same_split(renamed, recorded)
+
+
+def test_the_same_names_with_other_poses_are_another_data_set():
+    made = dataset([1000])
+    moved = replace(made, poses=made.poses + 1e-3)
+    with pytest.raises(SourceError, match="another data set"):
+        same_split(moved, make_split(made, "random", 0).spec(made))
+
+
+@pytest.mark.parametrize("kind", ["random", "block", "sequence"])
+def test_for_calibration_a_data_sets_own_training_list_is_not_new(kind):
+    made = dataset([200] * 10, own_train=range(4), own_test=range(4, 10))
+    split = make_split(made, kind, 0, "calibration")
+    used = np.concatenate(list(split.roles.values()))
+    assert set(made.sequence[used].tolist()) <= set(range(4, 10))
+    assert all(indices.size for indices in split.roles.values())
+    assert default_kind(dataset([9] * 9, range(7), range(7, 9)), "calibration") == "block"
 
 
 @pytest.mark.parametrize("kind", ["random", "block", "sequence"])

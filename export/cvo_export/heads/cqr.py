@@ -224,7 +224,9 @@ def _train(lessons: Lessons, config: CqrConfig) -> CqrHead:
         network = learn("cqr", everything[: lessons.n_train])
         held_out, others = [rows], [network]
     features, poses = lessons.features()
-    copies = np.linspace(0, len(features) - 1, config.forest_copies + 2)[:-1].round().astype(int)
+    # Evenly over the grades; each once, where there are fewer copies than asked for.
+    spread = np.linspace(0, len(features) - 1, config.forest_copies + 2)[:-1]
+    copies = np.unique(spread.round().astype(int))
     features, poses = features[copies], poses[copies]
     point = np.zeros((*features.shape[:2], DOF))
     for fold, other in zip(held_out, others, strict=True):

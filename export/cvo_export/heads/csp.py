@@ -65,7 +65,7 @@ class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unkno
         Dropout behind the trunk's layers while training.
     """
 
-    classes: Annotated[int, Meta(ge=2, le=512)] = 128
+    classes: Annotated[int, Meta(ge=2, le=256)] = 128
     labels: Literal["ordinal", "one_hot"] = "ordinal"
     label_sigma: Annotated[float, Meta(gt=0)] | None = None
     hidden: tuple[int, int] = (256, 128)
@@ -94,12 +94,17 @@ class Classes(nn.Module):
         """Cut standardised training poses (n, 6) into at most ``count`` classes a DoF."""
         rows, middles = [], []
         for values in y.T:
-            edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1)))
+            # No more classes than there are gaps between poses: a camera may rest.
+            shares = min(count, np.unique(values).size - 1)
+            edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, shares + 1)))
             margin = _MARGIN * (edges[-1] - edges[0])
             edges[0] -= margin
             edges[-1] += margin
             index = np.searchsorted(edges[1:-1], values, side="right")
-            medians = [np.median(values[index == k]) for k in range(edges.size - 1)]
+            medians = [
+                np.median(values[index == k]) if (index == k).any() else edges[k : k + 2].mean()
+                for k in range(edges.size - 1)
+            ]
             missing = count + 1 - edges.size
             rows.append(np.append(edges, [edges[-1]] * missing))
             middles.append(np.append(medians, [0.0] * missing))

@@ -1,0 +1,55 @@
+"""The demonstration bundles: each runs here, as it ran where it was made."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cvo_edge import Odometer, open_source
+from cvo_edge.selftest import check_selftest
+from cvo_edge.trajectory import open_ground_truth
+
+ARTIFACTS = Path(__file__).resolve().parents[2] / "calibration_artifacts"
+METHODS = ["cjp", "cqr", "csp"]
+
+
+@pytest.fixture(params=METHODS)
+def demonstration(request):
+    return ARTIFACTS / f"synthetic-room-{request.param}"
+
+
+def test_it_passes_its_self_test_and_is_of_its_method(demonstration):
+    with Odometer.load(demonstration) as odometer:
+        assert check_selftest(odometer) < odometer.calibration.selftest.tolerance
+        assert odometer.calibration.name == demonstration.name
+        assert demonstration.name.endswith(odometer.calibration.method)
+
+
+def test_it_is_small_enough_for_a_repository(demonstration):
+    assert (demonstration / "model.onnx").stat().st_size <= 8 * 2**20
+    assert (demonstration / "calibration.json").stat().st_size <= 64 * 1024
+
+
+@pytest.mark.parametrize("scope", ["marginal", "joint"])
+def test_the_clip_is_covered_about_as_often_as_stated(demonstration, clip_dir, scope):
+    # A new flight of the scene that was trained on: far from exact theory, near the number.
+    truth = open_ground_truth(clip_dir)
+    with Odometer.load(demonstration, scope=scope) as odometer:
+        estimates = list(odometer.stream(open_source(str(clip_dir))))
+    assert all(estimate.bounded for estimate in estimates)
+    covered = np.array([estimate.covers(truth.pose_of(estimate)) for estimate in estimates])
+    assert covered.mean() > 0.75
+
+
+def test_every_record_is_json_and_bands_are_ordered_and_disjoint(demonstration, clip_dir):
+    with Odometer.load(demonstration) as odometer:
+        for estimate in odometer.stream(open_source(str(clip_dir))):
+            record = json.loads(json.dumps(estimate.to_dict(), default=list, allow_nan=False))
+            bands = record["interval"]["bands"]
+            assert (bands is None) is (odometer.calibration.method != "csp")
+            for dof, row in enumerate(bands or []):
+                flat = [end for band in row for end in band]
+                assert flat == sorted(set(flat))
+                assert flat[0] == record["interval"]["lower"][dof]
+                assert flat[-1] == record["interval"]["upper"][dof]
