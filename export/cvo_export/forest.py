@@ -7,6 +7,10 @@ A forest of T trees gives every training row i a weight at x,
 over *all* rows, in the bag of a tree or not; F(y | x) = sum_i w_i(x) 1{y_i <= y} and the quantile
 at tau is the smallest y_i with F(y_i | x) >= tau. scikit-learn grows the trees; everything after
 that is here, once in numpy and once as a graph of standard operators.
+
+The library quantile-forest aggregates differently: by default it keeps one random row a leaf, pools
+leaves without weights and interpolates between labels; and it knows only the rows in a tree's bag.
+With all rows kept, leaves weighted and no bootstrap it agrees up to the interpolation.
 """
 
 from __future__ import annotations
