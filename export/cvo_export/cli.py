@@ -29,6 +29,7 @@ class MethodName(StrEnum):
     CJP = "cjp"
     CQR = "cqr"
     CSP = "csp"
+    MCQR = "mcqr"
 
 
 class SplitName(StrEnum):

@@ -210,13 +210,12 @@ def _level_lines(rule: str, levels: list[dict[str, Any]]) -> list[str]:
 def _recalibrated(
     odometer: Odometer, dataset: PoseDataset, split: Split, rule: Rule
 ) -> tuple[Threshold, ...]:
-    scores = []
-    for role in ("cal", "val"):
-        seen = observe(odometer, dataset, split.roles[role])
-        scores.append((odometer.head.scores(seen.outputs, seen.point, seen.truth), seen.sequence))
-    (cal_scores, cal_sequence), (val_scores, _) = scores
+    cal, val = (
+        observe(odometer, dataset, split.roles[role]).scored(odometer.head)
+        for role in ("cal", "val")
+    )
     joint = odometer.calibration.calibration.joint
-    return thresholds(odometer.head, cal_scores, cal_sequence, val_scores, rule, joint)
+    return thresholds(odometer.head, cal, val, rule, joint)
 
 
 @dataclass(frozen=True)
@@ -252,10 +251,7 @@ class _Sets:
         alpha = (1.0 - entry.confidence) * (2.0 if one_bound else 1.0)
         score = interval_score(width, distance, alpha)
         deviation = np.array(self.calibration.pose.standard_deviation)
-        nonconformity = self.odometer.head.scores(
-            self.seen.outputs, self.seen.point, self.seen.truth
-        )
-        effective_test = effective_frames(nonconformity, self.seen.sequence)
+        effective_test = effective_frames(self.seen.scored(self.odometer.head))
         # The band is that of one order statistic of frames: it says nothing of a rule that counts
         # sequences, of two thresholds a set, or of six that hold together by Bonferroni.
         finite = (
