@@ -24,12 +24,18 @@ app = typer.Typer(
 
 
 class MethodName(StrEnum):
-    """Methods that can be trained."""
+    """Methods that can be trained, and baselines."""
 
     CJP = "cjp"
     CQR = "cqr"
     CSP = "csp"
     MCQR = "mcqr"
+    MC_DROPOUT = "mc-dropout"
+    ENSEMBLE = "ensemble"
+    GAUSSIAN = "gaussian"
+    MDN = "mdn"
+    PINBALL = "pinball"
+    SPLIT = "split"
 
 
 class SplitName(StrEnum):
@@ -157,7 +163,13 @@ DatasetArgument = Annotated[
 
 @app.command()
 def train(
-    method: Annotated[MethodName, typer.Argument(help="Conformal method.", show_default=False)],
+    method: Annotated[
+        MethodName,
+        typer.Argument(
+            help="Conformal method (cjp, cqr, csp); the others are baselines to compare with.",
+            show_default=False,
+        ),
+    ],
     dataset: DatasetArgument,
     run_dir: Annotated[
         Path,
@@ -240,7 +252,10 @@ def train(
         float | None, typer.Option(help="cqr: share of inputs tried at a split, 0.33.")
     ] = None,
     components: Annotated[
-        int | None, typer.Option(min=0, help="cqr: principal components the forest sees, 58.")
+        int | None,
+        typer.Option(
+            min=0, help="cqr: principal components the forest sees, 58; mdn: Gaussians, 5."
+        ),
     ] = None,
     forest: Annotated[
         ForestName | None, typer.Option(help="cqr: shared by default; per_dof: the paper's.")
@@ -262,6 +277,9 @@ def train(
     label_sigma: Annotated[
         float | None,
         typer.Option(min=0.01, help="csp: deviation of the labels in classes; val chooses."),
+    ] = None,
+    dropout: Annotated[
+        float | None, typer.Option(min=0, max=0.99, help="mc-dropout: rate, 0.1; cjp, csp: 0.")
     ] = None,
 ) -> None:
     """Train a method on a data set; interrupted, the same command goes on.
@@ -308,6 +326,7 @@ def train(
             "classes": classes,
             "labels": labels,
             "label_sigma": label_sigma,
+            "dropout": dropout,
         },
     )
     with show_progress() as progress:

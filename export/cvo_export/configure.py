@@ -12,7 +12,7 @@ from cvo_edge.preprocess import Crop
 from cvo_export.augment import AugmentConfig
 from cvo_export.backbone import NO_WEIGHTS, TIMM_WEIGHTS, BackboneConfig, Normalisation
 from cvo_export.datasets import open_dataset
-from cvo_export.heads import METHODS, HeadConfig
+from cvo_export.methods import TRAINABLE, TrainableConfig
 from cvo_export.run import TrainConfig
 from cvo_export.splits import Kind, default_kind
 
@@ -63,10 +63,10 @@ def configure(
     )
 
 
-def _head_config(method: str, options: dict[str, Any]) -> HeadConfig:
-    if method not in METHODS:
-        raise UsageError(f"method: expected one of {', '.join(METHODS)}, found {method}")
-    kind = METHODS[method].config
+def _head_config(method: str, options: dict[str, Any]) -> TrainableConfig:
+    if method not in TRAINABLE:
+        raise UsageError(f"method: expected one of {', '.join(TRAINABLE)}, found {method}")
+    kind = TRAINABLE[method].config
     given = {name: value for name, value in options.items() if value is not None}
     foreign = [name for name in given if name not in kind.__struct_fields__]
     if foreign:
@@ -75,7 +75,7 @@ def _head_config(method: str, options: dict[str, Any]) -> HeadConfig:
             "method"
         )
     try:
-        return cast("HeadConfig", msgspec.convert({"method": method, **given}, kind))
+        return cast("TrainableConfig", msgspec.convert({"method": method, **given}, kind))
     except msgspec.ValidationError as error:
         raise UsageError(str(error)) from None
 

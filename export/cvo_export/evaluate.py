@@ -15,12 +15,14 @@ from cvo_edge import geometry
 from cvo_edge.artifact import Calibration, Threshold, read_bundle
 from cvo_edge.conformal import conformal_rank, interval_score
 from cvo_edge.errors import GateError
+from cvo_edge.heads.cqr import CqrHead, IntervalScore
 from cvo_edge.heads.csp import CspHead
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import ConformalSet
 from cvo_export.calibrate import Observed, Rule, effective_frames, observe, thresholds, workspace
 from cvo_export.datasets import PoseDataset
 from cvo_export.splits import Split, same_split
+from cvo_export.volume import ellipsoids_volume
 
 Array = NDArray[np.float64]
 Subset = Literal["test", "all"]
@@ -72,6 +74,7 @@ def evaluate(
             # Then "all" may hold frames that the network was trained on.
             "named_as_training_data": dataset.name == calibration.provenance.dataset,
             "point_error": point_error(seen),
+            "own": sets.own(),
             "levels": levels,
             "sequences": sets.sequences(dataset),
         }
@@ -113,6 +116,17 @@ def point_error(seen: Observed) -> dict[str, float]:
         "p90_m": float(np.quantile(distance, 0.9)),
         "p90_deg": float(np.quantile(angle, 0.9)),
     }
+
+
+def region_volume(region: ConformalSet, deviation: Array) -> float:
+    """Volume of the region in which all six degrees of freedom lie, in standardised units.
+
+    The product of six sets, or a union of ellipsoids. ``deviation`` (6,): standard deviation of
+    each degree of freedom's poses, m and rad.
+    """
+    if region.ellipsoids is not None:
+        return ellipsoids_volume(region.ellipsoids) / float(deviation.prod())
+    return float((region.width() / deviation).prod())
 
 
 def coverage_band(n_calibration: int, n_test: int, confidence: float) -> list[float] | None:
@@ -158,6 +172,13 @@ def table(report: Mapping[str, Any]) -> list[str]:
     ]
     if report["subset"] == "all" and report["named_as_training_data"]:
         lines.append("the name is that of the training data: true only if no frame is of it")
+    if report["own"] is not None:
+        own = report["own"]
+        coverage = " ".join(f"{value:.3f}" for value in own["coverage"])
+        lines.append(
+            f"own bounds for 0.9, not calibrated: coverage {coverage}, all six "
+            f"{own['joint_coverage']:.3f}, score {own['normalised_interval_score']:.3f}"
+        )
     lines += _level_lines(report["rule"], report["levels"])
     if "other_rule" in report:
         lines += _level_lines(report["other_rule"]["rule"], report["other_rule"]["levels"])
@@ -231,9 +252,18 @@ class _Sets:
     def calibration(self) -> Calibration:
         return self.odometer.calibration
 
+    @property
+    def deviation(self) -> Array:
+        return np.array(self.calibration.pose.standard_deviation)
+
     def covered(self, regions: list[ConformalSet]) -> NDArray[np.bool_]:
         """Which true numbers lie in these sets, (n, 6)."""
         return np.array([r.covers(y) for r, y in zip(regions, self.seen.truth, strict=True)])
+
+    def covered_jointly(self, regions: list[ConformalSet]) -> float:
+        """Share of frames whose true numbers lie in these sets all six at once."""
+        pairs = zip(regions, self.seen.truth, strict=True)
+        return float(np.mean([region.contains(y) for region, y in pairs]))
 
     def level(self, entry: Threshold) -> dict[str, Any]:
         """Return the report's entry for one threshold."""
@@ -242,15 +272,11 @@ class _Sets:
         bounded = np.array([np.isfinite((r.lower, r.upper)).all() for r in regions])
         limits = workspace(self.calibration)
         limited = [region.within(*limits) for region in regions]
-        width = np.array([region.width() for region in limited])
-        distance = np.array([r.distance(y) for r, y in zip(limited, self.seen.truth, strict=True)])
         n, n_test = self.calibration.calibration.n, len(covered)
         used = [level for level in self.odometer.head.side_confidences(0.9) if level is not None]
         one_bound = len(used) < len(self.odometer.head.side_confidences(0.9))
         # A single bound is penalised by 1/alpha, an interval by 2/alpha.
         alpha = (1.0 - entry.confidence) * (2.0 if one_bound else 1.0)
-        score = interval_score(width, distance, alpha)
-        deviation = np.array(self.calibration.pose.standard_deviation)
         effective_test = effective_frames(self.seen.scored(self.odometer.head))
         # The band is that of one order statistic of frames: it says nothing of a rule that counts
         # sequences, of two thresholds a set, or of six that hold together by Bonferroni.
@@ -274,13 +300,55 @@ class _Sets:
             if finite
             else None,
             "coverage_band_exact": self.exact,
-            "joint_coverage": float(covered.all(axis=1).mean()),
+            "joint_coverage": self.covered_jointly(regions),
+            **self.widths(limited, alpha),
+            "unbounded_share": float(1.0 - bounded.mean()),
+            **(self.volumes(limited) if entry.scope == "joint" else {}),
+            **self.pieces(regions),
+        }
+
+    def widths(self, regions: list[ConformalSet], alpha: float) -> dict[str, Any]:
+        """Widths and interval score (6,) of bounded sets, and its mean over the deviations."""
+        width = np.array([region.width() for region in regions])
+        distance = np.array([r.distance(y) for r, y in zip(regions, self.seen.truth, strict=True)])
+        score = interval_score(width, distance, alpha).mean(axis=0)
+        return {
             "mean_width": width.mean(axis=0).tolist(),
             "median_width": np.median(width, axis=0).tolist(),
-            "interval_score": score.mean(axis=0).tolist(),
-            "normalised_interval_score": float((score.mean(axis=0) / deviation).mean()),
-            "unbounded_share": float(1.0 - bounded.mean()),
-            **self.pieces(regions),
+            "interval_score": score.tolist(),
+            "normalised_interval_score": float((score / self.deviation).mean()),
+        }
+
+    def volumes(self, regions: list[ConformalSet]) -> dict[str, Any]:
+        """Return volumes of the joint sets of all frames, bounded, in standardised units."""
+        volume = np.array([region_volume(region, self.deviation) for region in regions])
+        with np.errstate(divide="ignore"):  # a set without width has none
+            logarithm = np.log(volume)
+        return {
+            "joint_volume": {
+                "mean": float(volume.mean()),
+                "median": float(np.median(volume)),
+                "geometric_mean": float(np.exp(logarithm.mean())),
+            }
+        }
+
+    def own(self) -> dict[str, Any] | None:
+        """Return the figures of the network's own bounds, taken as 90 %, before any threshold.
+
+        None for a network that gives none.
+        """
+        outputs = self.seen.outputs
+        if not isinstance(self.odometer.head, CqrHead) or "lower" not in outputs:
+            return None
+        lower, upper = outputs["lower"].astype(np.float64), outputs["upper"].astype(np.float64)
+        # The additive score's set at the threshold zero.
+        rows = zip(lower, upper, self.seen.point, strict=True)
+        regions = [IntervalScore(None).inverse(*row, np.zeros(6), np.zeros(6)) for row in rows]
+        covered = self.covered(regions)
+        return {
+            "coverage": covered.mean(axis=0).tolist(),
+            "joint_coverage": float(covered.all(axis=1).mean()),
+            **self.widths(regions, 0.1),
         }
 
     def pieces(self, regions: list[ConformalSet]) -> dict[str, Any]:
@@ -303,7 +371,8 @@ class _Sets:
             return {}
         head = self.odometer.head
         covered = self.covered(self.seen.regions(head, marginal))
-        jointly = np.asarray(self.covered(self.seen.regions(head, joint)).all(axis=1))
+        pairs = zip(self.seen.regions(head, joint), self.seen.truth, strict=True)
+        jointly = np.array([region.contains(y) for region, y in pairs])
         found = {}
         for number in np.unique(self.seen.sequence).tolist():
             rows = np.flatnonzero(np.equal(self.seen.sequence, number))

@@ -120,7 +120,7 @@ def _draft(
     return Calibration(
         schema_version=1,
         name=name,
-        method=run.config.method,
+        method=run.graph.head.runtime_method,
         model=model_spec(model_bytes, OPSET),
         preprocess=artifact.PreprocessSpec(
             height=config.height,
@@ -167,6 +167,7 @@ def _draft(
             training_split=run.split.spec(run.dataset),
             options={
                 **_options(run),
+                "network": config.method,
                 "lesson": run.best.lesson,
                 "parity": float(f"{parity:.3g}"),
             },

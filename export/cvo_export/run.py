@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import msgspec
 import torch
 from torch import Tensor, nn
 
-from cvo_edge.artifact import MethodName
 from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.preprocess import Crop
 from cvo_export.augment import AugmentConfig
 from cvo_export.backbone import Backbone, BackboneConfig
 from cvo_export.datasets import PoseDataset, open_dataset
-from cvo_export.heads import METHODS, ExportedHead, HeadConfig, Setting
+from cvo_export.heads import ExportedHead, Setting
+from cvo_export.methods import TRAINABLE, TrainableConfig
 from cvo_export.splits import Kind, Split, make_split, read_split_spec, same_split
 from cvo_export.target import Target
 
@@ -54,7 +54,7 @@ class TrainConfig:
 
     dataset: str
     split: Kind
-    head: HeadConfig
+    head: TrainableConfig
     seed: int = 0
     height: int = 192
     width: int = 256
@@ -73,9 +73,9 @@ class TrainConfig:
     backbone_learning_rate: float = 3e-4
 
     @property
-    def method(self) -> MethodName:
-        """Name of the method, the tag of its options."""
-        return cast("MethodName", self.head.__struct_config__.tag)
+    def method(self) -> str:
+        """Name of the method or baseline, the tag of its options."""
+        return str(self.head.__struct_config__.tag)
 
 
 class History(NamedTuple):
@@ -215,7 +215,7 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
     backbone = Backbone(config.backbone, config.height, config.width)
     backbone.load_state_dict(stored["backbone"])
     setting = Setting(backbone.size, target, config.seed)
-    head = METHODS[config.method].restore(setting, config.head, stored["head"])
+    head = TRAINABLE[config.method].restore(setting, config.head, stored["head"])
     graph = PoseGraph(backbone, head).eval()
     history = [History(*entry) for entry in stored["history"]]
     return Run(config, opened, split, target, graph, stored["weights_sha256"], history)

@@ -29,8 +29,9 @@ from cvo_edge.errors import UsageError
 from cvo_export.backbone import Backbone, load_weights
 from cvo_export.datasets import PoseDataset
 from cvo_export.features import FeatureExtractor, ModelImages, cached_copies
-from cvo_export.heads import METHODS, Setting
+from cvo_export.heads import Setting
 from cvo_export.heads.base import Examples, L, Learner
+from cvo_export.methods import TRAINABLE
 from cvo_export.progress import Progress
 from cvo_export.run import History, PoseGraph, Run, TrainConfig, claim_run, open_run
 from cvo_export.splits import deal_folds
@@ -81,7 +82,7 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
         n_train=split.roles["train"].size,
         folds=partial(deal_folds, dataset, split, indices),
     )
-    head = METHODS[config.method].train(trainer, config.head)
+    head = TRAINABLE[config.method].train(trainer, config.head)
     graph = PoseGraph(backbone, head).eval()
     run = Run(config, dataset, split, target, graph, weights_sha256, trainer.history)
     run.save(run_dir)

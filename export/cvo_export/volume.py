@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.pose import Ellipsoids
+
 Array = NDArray[np.float64]
 
 _DRAWS = 400
@@ -38,13 +40,8 @@ def union_log_volume(centres: Array, radius: float, draws: int = _DRAWS) -> floa
     return float(math.log(count) + ball + d * math.log(radius) + once)
 
 
-def ellipsoids_log_volume(
-    centres: Array, scale: Array, radius: float, draws: int = _DRAWS
-) -> float:
-    """The same for ellipsoids {scale v : |v| <= radius} about centres (J, d).
-
-    scale (d, d) is lower triangular with a positive diagonal.
-    """
-    log_determinant = float(np.log(np.diag(scale)).sum())
-    scaled = np.asarray(np.linalg.solve(scale, centres.T).T, np.float64)
-    return union_log_volume(scaled, radius, draws) + log_determinant
+def ellipsoids_volume(region: Ellipsoids) -> float:
+    """Volume of a union of ellipsoids, in the units of its chart: m^3 rad^3."""
+    centres = np.linalg.solve(region.scale, region.centres.astype(np.float64).T).T
+    log_determinant = float(np.log(np.abs(np.diag(region.scale))).sum())
+    return math.exp(union_log_volume(centres, region.radius) + log_determinant)

@@ -13,7 +13,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from cvo_edge.artifact import Six
+from cvo_edge.artifact import MethodName, Six
 from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_edge.pose import Rotation
 from cvo_export.bundle import HALF_WIDTH_FLOOR, six
@@ -98,6 +98,8 @@ class ExportedHead(nn.Module):
     ----------
     output_names
         Of the tuple that ``forward`` returns; the first is ``pose`` (n, 7).
+    runtime_method
+        The method of the runtime that reads these outputs.
     rotation
         The chart of the six numbers.
     extra_inputs
@@ -105,6 +107,7 @@ class ExportedHead(nn.Module):
     """
 
     output_names: tuple[str, ...]
+    runtime_method: MethodName
     rotation: Rotation = "tangent_reference"
     extra_inputs: Mapping[str, Tensor] = {}
 

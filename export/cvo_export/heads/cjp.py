@@ -207,6 +207,7 @@ class CjpHead(ExportedHead):
     """Features -> pose (n, 7), lower and upper (n, 6); noise is an input in ``sample`` mode."""
 
     output_names = ("pose", "lower", "upper")
+    runtime_method = "cjp"
 
     def __init__(self, network: CjpNetwork, setting: Setting) -> None:
         super().__init__()

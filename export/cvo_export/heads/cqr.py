@@ -103,6 +103,7 @@ class CqrHead(ExportedHead):
     """Features -> pose (n, 7) and the forest's input; ``completed`` with lower and upper."""
 
     output_names = ("pose", "forest_input")
+    runtime_method = "cqr"
     rotation = "tangent_predicted"
 
     def __init__(

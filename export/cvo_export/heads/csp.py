@@ -213,6 +213,7 @@ class CspHead(ExportedHead):
     """Features -> pose (n, 7), the expected class median, and probabilities (n, 6, K)."""
 
     output_names = ("pose", "probabilities")
+    runtime_method = "csp"
 
     def __init__(self, network: CspNetwork, temperature: Tensor, setting: Setting) -> None:
         super().__init__()

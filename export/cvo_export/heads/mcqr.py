@@ -145,6 +145,7 @@ class McqrHead(ExportedHead):
     """
 
     output_names = ("pose", "codebook", "scale")
+    runtime_method = "mcqr"
     rotation = "tangent_predicted"
 
     def __init__(
