@@ -110,9 +110,13 @@ class Regions:
         return codebook, scale, list(codebook)
 
     def scores(self, x: Array, y: Array) -> Array:
-        """Scaled distances (n,) of y (n, d); in parts, as a grid has 4096 points."""
-        parts = np.array_split(np.arange(len(x)), math.ceil(len(x) / 100))
-        return np.concatenate([scaled_distances(*self.points(x[r])[:2], y[r]) for r in parts])
+        """Scaled distances (n,) of y (n, d) at x (n, 1) or at one x (1, 1)."""
+        at_one = self.points(x)[:2] if len(x) == 1 else None
+        # In parts, as a grid has 4096 points.
+        parts = np.array_split(np.arange(len(y)), math.ceil(len(y) / 200))
+        return np.concatenate(
+            [scaled_distances(*(at_one or self.points(x[rows])[:2]), y[rows]) for rows in parts]
+        )
 
     def areas(self, x: Array) -> Array:
         """Area or volume of the region at each condition (n, 1)."""
@@ -212,7 +216,7 @@ def draw(name: str, d: int, sets: dict[str, Regions | Boxes], path: Path) -> Non
             samples = samples[np.abs(samples[:, 2] - third) < 0.1]
             plane = np.column_stack([plane, np.full(len(plane), third)])
         for kind, colour in (("box", "tab:orange"), ("grid", "tab:green"), ("region", "tab:blue")):
-            scores = sets[kind].scores(np.full((len(plane), 1), at), plane)
+            scores = sets[kind].scores(np.full((1, 1), at), plane)
             inside = (scores <= sets[kind].radius).reshape(len(b), len(a)).astype(float)
             if kind == "region":
                 axis.contourf(a, b, inside, levels=(0.5, 1.5), colors=[colour], alpha=0.25)

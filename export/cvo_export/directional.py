@@ -206,7 +206,10 @@ def mean_volume(
 
 
 def scaled_distances(codebook: Array, scale: Array, y: Array) -> Array:
-    """Codebook (n, J, d) before B, B (n, d, d), y (n, d) -> distance to the nearest point, (n,)."""
+    """Codebook (n, J, d) before B, B (n, d, d), y (n, d) -> distance to the nearest point, (n,).
+
+    Or one codebook and one B for all y.
+    """
     v = np.linalg.solve(scale, y[:, :, np.newaxis])[:, np.newaxis, :, 0]
     return np.asarray(np.linalg.norm(codebook - v, axis=2).min(axis=1))
 

@@ -137,7 +137,7 @@ class _Material:
 class _Trainer:
     """The lessons of a run; see ``cvo_export.heads.base.Lessons``.
 
-    A run that fine-tunes its backbone has one lesson: another would learn from other features.
+    A run that fine-tunes its backbone has one lesson on features: another would learn from others.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class _Trainer:
         examples: Examples | None = None,
     ) -> L:
         """Train what ``build`` makes, with random numbers of its own name."""
-        if self.fine_tuned and self.history:
+        if self.fine_tuned and self.history and examples is None:
             raise UsageError(f"fine-tune: expected a method of one lesson, found another, {name}")
         torch.manual_seed(_lesson_seed(self.setting.seed, name))
         learner = build()
@@ -213,7 +213,8 @@ class _Lesson:
         """Run all phases, from the checkpoint if there is one; returns the history."""
         checkpoint = self._read_checkpoint()
         first = checkpoint["phase"] if checkpoint else 0
-        for phase in range(first, 3 if self.config.fine_tune else 1):
+        phases = 3 if self.config.fine_tune and self._examples is None else 1
+        for phase in range(first, phases):
             state = checkpoint if checkpoint and phase == first else None
             if phase == 1:
                 self._fit_all(phase, state)

@@ -22,7 +22,6 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvo_edge.errors import UsageError
 from cvo_edge.heads.mcqr import McqrParameters
 from cvo_export.calibrate import Candidate
 from cvo_export.directional import RegionConfig, RegionNetwork, best_kappa, mean_volume
@@ -194,8 +193,6 @@ class McqrHead(ExportedHead):
 
 
 def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
-    if lessons.fine_tuned:
-        raise UsageError("fine-tune: expected none for mcqr, whose region has a lesson of its own")
     setting, passes = lessons.setting, config.augmentation != "none"
     held_out = learn_held_out(
         lessons,
