@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.artifact import read_bundle
-from cvo_edge.conformal import JointScale, conformal_quantile, conformal_rank
+from cvo_edge.conformal import conformal_quantile, conformal_rank
 from cvo_edge.odometer import Odometer
 from cvo_export.calibrate import observe
 from cvo_export.datasets import open_dataset
@@ -29,13 +29,14 @@ CONFIDENCE = 0.9
 
 
 def resplit(
-    scores: NDArray[np.float64], n: int, scale: JointScale, resplits: int
+    scores: NDArray[np.float64], joint: NDArray[np.float64], n: int, resplits: int
 ) -> tuple[NDArray[np.float64], float]:
-    """Mean coverage per DoF (6,) and mean joint coverage over many deals of scores (m, 1, 6)."""
+    """Mean coverage per DoF (6,) and mean joint coverage over many deals.
+
+    Of marginal scores (m, 6) and joint ones (m,).
+    """
     generator = np.random.default_rng(0)
     marginal, jointly = [], []
-    joint = scale.comparable(scores).max(axis=(1, 2))
-    scores = scores[:, 0]
     order = np.arange(len(scores))
     for deal in range(resplits):
         order = order[::-1] if deal % 2 else generator.permutation(len(scores))
@@ -60,14 +61,14 @@ def main() -> None:
     roles = same_split(dataset, recorded).roles
     with Odometer(bundle) as odometer:
         seen = observe(odometer, dataset, np.concatenate([roles["cal"], roles["test"]]))
-        scores = odometer.head.scores(seen.outputs, seen.point, seen.truth)
-        val = observe(odometer, dataset, roles["val"])
-        scale = odometer.head.joint_scale(odometer.head.scores(val.outputs, val.point, val.truth))
+        scored = seen.scored(odometer.head)
+        val = observe(odometer, dataset, roles["val"]).scored(odometer.head)
+        joint = odometer.head.joint_scale(val.joint).comparable(scored.joint).max(axis=(1, 2))
     n = roles["cal"].size
     expected = conformal_rank(n, CONFIDENCE) / (n + 1)
-    marginal, jointly = resplit(scores, n, scale, arguments.resplits)
+    marginal, jointly = resplit(scored.marginal[:, 0], joint, n, arguments.resplits)
     worst = max(abs(float(value) - expected) for value in (*marginal, jointly))
-    print(f"{arguments.resplits} deals of {len(scores)} frames, n = {n}: k/(n+1) = {expected:.4f}")
+    print(f"{arguments.resplits} deals of {len(joint)} frames, n = {n}: k/(n+1) = {expected:.4f}")
     print("coverage per DoF " + " ".join(f"{value:.4f}" for value in marginal))
     print(f"joint coverage   {jointly:.4f}")
     print(f"largest difference {worst:.4f}")

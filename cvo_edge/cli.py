@@ -78,6 +78,10 @@ def run(
         Path | None,
         typer.Option(help="TUM file or folder of .pose.txt; the summary then shows coverage."),
     ] = None,
+    region: Annotated[
+        bool,
+        typer.Option("--region", help="mcqr, scope joint: the region's points in every record."),
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No summary on stderr.")] = False,
 ) -> None:
     """Estimate a pose interval for every frame of a source."""
@@ -93,9 +97,14 @@ def run(
     with Odometer.load(
         bundle, threads=threads, confidence=confidence, scope=scope.value
     ) as odometer:
+        if region and not odometer.has_region:
+            raise UsageError(
+                f"region: expected a bundle of mcqr and the scope joint, found "
+                f"{odometer.calibration.method} and {scope.value}"
+            )
         frames = open_source(source, fps)
         summary = RunSummary(odometer.chart.dof, confidence, scope, with_truth=truth is not None)
-        with Sink(output, format.value) as sink:
+        with Sink(output, format.value, region=region) as sink:
             try:
                 run_frames(
                     odometer,

@@ -29,7 +29,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         f"calibrated   on {source.n} frames of {source.n_sequences} sequence(s) of "
         f"{source.dataset}, split {source.split.kind} (seed {source.split.seed}), {source.rule}"
         + _worth(source),
-        f"joint        by {source.joint}",
+        f"joint        by {_joint(calibration)}",
         f"backbone     {calibration.provenance.backbone or 'a given network'}",
         "",
         f"{'q_hat at':<16}" + "".join(f"{name:>11}" for name in dof),
@@ -58,6 +58,13 @@ def _details(calibration: Calibration) -> str:
         counts = [len(row) - 1 for row in parameters.edges]
         return f", {min(counts)} to {max(counts)} classes a degree of freedom"
     return ""
+
+
+def _joint(calibration: Calibration) -> str:
+    method = calibration.method
+    if method in HEADS and HEADS[method].one_joint_score:
+        return "distance to the points of a region"
+    return calibration.calibration.joint
 
 
 def _unbounded(calibration: Calibration) -> list[str]:

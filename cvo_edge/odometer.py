@@ -240,6 +240,11 @@ class Odometer:
                 fault = Reason.POSE_IMPLAUSIBLE
         return Observation(outputs, pose, point, fault, 1e3 * (ready - start), 1e3 * (done - ready))
 
+    @property
+    def has_region(self) -> bool:
+        """Whether sets are a region of all six degrees of freedom, not six sets."""
+        return self.scope == "joint" and self.head.one_joint_score
+
     def region(self, observation: Observation, threshold: Threshold | None = None) -> ConformalSet:
         """The conformal set of an observation, by default at the odometer's own threshold."""
         return self.head.region(observation.outputs, observation.point, threshold or self.threshold)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import product
 from statistics import NormalDist
@@ -150,6 +150,63 @@ class Chart:
 
 
 @dataclass(frozen=True, eq=False)
+class Ellipsoids:
+    """A region of all six degrees of freedom: a union of ellipsoids of one shape.
+
+    It holds y where min_j |scale^-1 (y - centres_j)| <= radius.
+
+    Attributes
+    ----------
+    centres
+        Shape (J, 6), in the bundle's chart, m and rad.
+    scale
+        Shape (6, 6), lower triangular, in units of the chart.
+    radius
+        In units of the scale, at least 0.
+    """
+
+    centres: NDArray[Any]
+    scale: Array
+    radius: float
+
+    def distance(self, coordinates: ArrayLike) -> float:
+        """Scaled distance of six coordinates (6,) to the nearest centre."""
+        return float(scaled_distance(self.centres, self.scale, np.asarray(coordinates, np.float64)))
+
+    def contains(self, coordinates: ArrayLike) -> bool:
+        """Whether six coordinates (6,) lie in the region."""
+        return self.distance(coordinates) <= self.radius
+
+    def to_dict(self) -> dict[str, Any]:
+        """The record's ``region``."""
+        return {
+            "radius": self.radius,
+            "scale": self.scale.tolist(),
+            "centres": self.centres.tolist(),
+        }
+
+
+def scaled_distance(centres: NDArray[Any], scale: NDArray[Any], y: Array) -> Array:
+    """Return min_j |scale^-1 (y - centres_j)|.
+
+    Centres (..., J, 6), lower triangular scale (..., 6, 6) and y (..., 6) -> (...). Infinite where
+    the scale has no inverse: what has no extent holds nothing.
+    """
+    difference = y[..., np.newaxis, :] - centres.astype(np.float64)
+    rows = scale.astype(np.float64)[..., np.newaxis, :, :]
+    solved = np.empty_like(difference)
+    squared = np.zeros(difference.shape[:-1])
+    # Forward substitution, one row after the other.
+    with np.errstate(all="ignore"):
+        for d in range(difference.shape[-1]):
+            known = (rows[..., d, :d] * solved[..., :d]).sum(axis=-1)
+            solved[..., d] = (difference[..., d] - known) / rows[..., d, d]
+            squared += solved[..., d] ** 2
+        nearest = np.sqrt(np.nan_to_num(squared, nan=np.inf, posinf=np.inf)).min(axis=-1)
+    return np.asarray(nearest)
+
+
+@dataclass(frozen=True, eq=False)
 class ConformalSet:
     """The set that holds each degree of freedom with the stated confidence.
 
@@ -162,12 +219,16 @@ class ConformalSet:
         ascending order; None where the set is its hull.
     crossed
         Whether a correction emptied the set of some DoF, so that its middle stands for it.
+    ellipsoids
+        For a method with a region of all six together, in the joint scope: that region, of which
+        lower and upper are the hull; None where the set is the product of its DoF's sets.
     """
 
     lower: Array
     upper: Array
     bands: Bands | None = None
     crossed: bool = False
+    ellipsoids: Ellipsoids | None = None
 
     def covers(self, coordinates: ArrayLike) -> NDArray[np.bool_]:
         """Which of six coordinates (6,) lie in the set, shape (6,); gaps count as outside."""
@@ -181,6 +242,12 @@ class ConformalSet:
             ]
         )
 
+    def contains(self, coordinates: ArrayLike) -> bool:
+        """Whether six coordinates (6,) lie in the region, where there is one, else in all sets."""
+        if self.ellipsoids is not None:
+            return self.ellipsoids.contains(coordinates)
+        return bool(self.covers(coordinates).all())
+
     def within(self, lowest: Array, highest: Array) -> ConformalSet:
         """Return the set with its unbounded sides put at these limits, (6,) each."""
         # A finite side beyond the limit of the other one leaves a set without width.
@@ -192,7 +259,7 @@ class ConformalSet:
                 row if math.isfinite(row[-1][1] - row[0][0]) else ((low, high),)
                 for row, low, high in zip(bands, lower.tolist(), upper.tolist(), strict=True)
             )
-        return ConformalSet(lower, upper, bands, self.crossed)
+        return replace(self, lower=lower, upper=upper, bands=bands)
 
     def width(self) -> Array:
         """Measure of the set per DoF, (6,): of the union of its bands, not of their hull."""
@@ -296,14 +363,21 @@ class PoseInterval:
 
         Raises UsageError for an invalid frame: there is no set to ask.
         """
+        return self.region.covers(self._coordinates(pose))
+
+    def contains(self, pose: Pose | ArrayLike) -> bool:
+        """Whether the set holds this pose in all six degrees of freedom at once.
+
+        In the joint scope of MCQR that is the region itself, which is smaller than its hull; else
+        whether ``covers`` is true of all six, and the errors are its.
+        """
+        return self.region.contains(self._coordinates(pose))
+
+    def _coordinates(self, pose: Pose | ArrayLike) -> Array:
         if self.pose is None:
             raise UsageError(f"frame {self.seq} is invalid: it has no set that could hold a pose")
         other = pose if isinstance(pose, Pose) else Pose.from_array(pose)
-        return self.region.covers(self.chart.coordinates(other.to_array(), self.pose.to_array()))
-
-    def contains(self, pose: Pose | ArrayLike) -> bool:
-        """Whether the set holds this pose in all six degrees of freedom; see ``covers``."""
-        return bool(self.covers(pose).all())
+        return self.chart.coordinates(other.to_array(), self.pose.to_array())
 
     def covariance(self) -> Array:
         """Shape (6, 6), diagonal: (half-width / z)^2 in m^2 and rad^2, infinite where unbounded.
@@ -314,8 +388,8 @@ class PoseInterval:
         z = NormalDist().inv_cdf(0.5 + 0.5 * self.confidence)
         return np.diag(((self.upper - self.lower) / (2.0 * z)) ** 2)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON record of this frame, as the README specifies it."""
+    def to_dict(self, *, region: bool = False) -> dict[str, Any]:
+        """The JSON record of this frame, as the README specifies it; on request with the region."""
         pose: dict[str, Any] | None = None
         interval: dict[str, Any] | None = None
         if self.pose is not None:
@@ -331,6 +405,9 @@ class PoseInterval:
                 "bounded": bounded,
                 "bands": self.bands if bounded or self.bands is None else _null_bands(self.bands),
             }
+        if region and interval is not None:
+            ellipsoids = self.region.ellipsoids
+            interval["region"] = None if ellipsoids is None else ellipsoids.to_dict()
         return {
             "seq": self.seq,
             "stamp_ns": self.stamp_ns,

@@ -52,10 +52,9 @@ class RunSummary:
             self.width_sum += estimate.region.width()
             self.disjoint += any(len(row) > 1 for row in estimate.bands or ())
         if truth is not None and estimate.pose is not None:
-            inside = estimate.covers(truth)
             self.compared += 1
-            self.covered += inside
-            self.covered_jointly += bool(inside.all())
+            self.covered += estimate.covers(truth)
+            self.covered_jointly += estimate.contains(truth)
 
     @property
     def frames(self) -> int:

@@ -31,15 +31,23 @@ class Sink:
         Output file, emptied when the first line is written, or ``-`` for standard output.
     format
         ``jsonl``, ``csv``, ``tum`` or, for reading by eye, ``table``.
+    region
+        Put the region's points into the records, where there is one; ``jsonl`` only.
 
     Raises
     ------
     SinkError
         The file cannot be opened or, later, written; every complete line is kept.
+    UsageError
+        A format whose lines have no place for a region.
     """
 
-    def __init__(self, path: str, format: Format) -> None:
+    def __init__(self, path: str, format: Format, *, region: bool = False) -> None:
         self._header, self._line = _FORMATS[format]
+        if region:
+            if format != "jsonl":
+                raise UsageError(f"region: expected the format jsonl, found {format}")
+            self._line = _json_line_with_region
         self._owned = path != "-"
         self._name = path if self._owned else "standard output"
         self._started = False
@@ -94,6 +102,10 @@ class Sink:
 
 def _json_line(estimate: PoseInterval) -> bytes:
     return msgspec.json.encode(estimate.to_dict()) + b"\n"
+
+
+def _json_line_with_region(estimate: PoseInterval) -> bytes:
+    return msgspec.json.encode(estimate.to_dict(region=True)) + b"\n"
 
 
 def _csv_header(estimate: PoseInterval) -> bytes:

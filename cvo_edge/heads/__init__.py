@@ -18,7 +18,8 @@ from cvo_edge.conformal import JointScale
 from cvo_edge.heads.cjp import CjpHead
 from cvo_edge.heads.cqr import CqrHead
 from cvo_edge.heads.csp import CspHead
-from cvo_edge.pose import ConformalSet
+from cvo_edge.heads.mcqr import McqrHead
+from cvo_edge.pose import ConformalSet, Scope
 
 Array = NDArray[np.float64]
 
@@ -31,6 +32,8 @@ class Head(Protocol):
     """
 
     parameters_type: ClassVar[type[Struct]]
+    # Whether the joint scope has a score of all six together, not six that are compared.
+    one_joint_score: ClassVar[bool]
     # Name and shape of every model output the method reads, all float32.
     outputs: Mapping[str, tuple[int, ...]]
 
@@ -46,8 +49,17 @@ class Head(Protocol):
     def joint_scale(self, scores: Array) -> JointScale:
         """Scores (n, sides, 6) of val -> how columns are compared for the joint scope."""
 
-    def scores(self, outputs: Mapping[str, NDArray[Any]], point: Array, truth: Array) -> Array:
-        """Outputs stacked over n frames; point and truth (n, 6) -> scores (n, sides, 6)."""
+    def scores(
+        self,
+        outputs: Mapping[str, NDArray[Any]],
+        point: Array,
+        truth: Array,
+        scope: Scope = "marginal",
+    ) -> Array:
+        """Outputs stacked over n frames; point and truth (n, 6) -> scores (n, sides, 6).
+
+        Those of the joint scope are other ones where ``one_joint_score``.
+        """
 
     def region(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
@@ -59,4 +71,5 @@ HEADS: dict[str, type[Head]] = {
     "cjp": CjpHead,
     "cqr": CqrHead,
     "csp": CspHead,
+    "mcqr": McqrHead,
 }

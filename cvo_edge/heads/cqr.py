@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from cvo_edge.artifact import Calibration, SixOrUnbounded, SixPositive, Threshold
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
-from cvo_edge.pose import ConformalSet
+from cvo_edge.pose import ConformalSet, Scope
 
 Array = NDArray[np.float64]
 Sides = Literal["symmetric", "asymmetric", "lower", "upper"]
@@ -91,6 +91,7 @@ class CqrHead:
     """Score and set of conformalized quantile regression."""
 
     parameters_type: ClassVar[type[Struct]] = CqrParameters
+    one_joint_score: ClassVar[bool] = False
 
     def __init__(self, calibration: Calibration) -> None:
         parameters = calibration.parameters(CqrParameters)
@@ -154,7 +155,13 @@ class CqrHead:
         """Scores (n, sides, 6) of other frames -> how columns are compared for the joint scope."""
         return LinearScale.fitted(scores)
 
-    def scores(self, outputs: Mapping[str, NDArray[Any]], point: Array, truth: Array) -> Array:
+    def scores(
+        self,
+        outputs: Mapping[str, NDArray[Any]],
+        point: Array,
+        truth: Array,
+        scope: Scope = "marginal",
+    ) -> Array:
         """Outputs stacked over n frames, point and truth (n, 6) -> scores (n, sides, 6)."""
         sides = self._score.sides(*self._interval(outputs, point), point, truth)
         return sides.max(axis=1, keepdims=True) if self._sides == "symmetric" else sides

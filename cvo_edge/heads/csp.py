@@ -29,7 +29,7 @@ from cvo_edge.artifact import Calibration, Threshold
 from cvo_edge.conformal import JointScale, RankScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads.cqr import infinite_where_null
-from cvo_edge.pose import ConformalSet
+from cvo_edge.pose import ConformalSet, Scope
 
 Array = NDArray[np.float64]
 Edges = Annotated[tuple[float, ...], Meta(min_length=3, max_length=513)]
@@ -60,6 +60,7 @@ class CspHead:
     """Score and set of conformalized set prediction."""
 
     parameters_type: ClassVar[type[Struct]] = CspParameters
+    one_joint_score: ClassVar[bool] = False
 
     def __init__(self, calibration: Calibration) -> None:
         self.parameters = calibration.parameters(CspParameters)
@@ -103,7 +104,13 @@ class CspHead:
             top += self.parameters.penalty * max(0, ranks)
         return RankScale.fitted(scores, top)
 
-    def scores(self, outputs: Mapping[str, NDArray[Any]], point: Array, truth: Array) -> Array:
+    def scores(
+        self,
+        outputs: Mapping[str, NDArray[Any]],
+        point: Array,
+        truth: Array,
+        scope: Scope = "marginal",
+    ) -> Array:
         """Output ``probabilities`` (n, 6, K), point and truth (n, 6) -> scores (n, 1, 6)."""
         classes = self._class_scores(outputs["probabilities"])
         of_truth = np.full(truth.shape, np.inf)

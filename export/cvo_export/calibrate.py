@@ -48,6 +48,14 @@ class Candidate(NamedTuple):
     parameters: Struct
 
 
+class Scored(NamedTuple):
+    """Scores of n frames of each scope, (n, sides, 6), and their sequence numbers (n,)."""
+
+    marginal: Array
+    joint: Array
+    sequence: NDArray[np.int64]
+
+
 @dataclass(frozen=True)
 class Observed:
     """Frames that passed the frame checks, as the runtime sees them, stacked over n frames.
@@ -65,6 +73,13 @@ class Observed:
     true_pose: Array
     sequence: NDArray[np.int64]
     flagged: int
+
+    def scored(self, head: Head) -> Scored:
+        """Return the scores of the true poses."""
+        marginal, joint = (
+            head.scores(self.outputs, self.point, self.truth, scope) for scope in SCOPES
+        )
+        return Scored(marginal, joint, self.sequence)
 
     def regions(self, head: Head, entry: Threshold) -> list[ConformalSet]:
         """Return the set of every frame at a threshold."""
@@ -133,7 +148,14 @@ def calibrated(
         The model or a candidate is not of the draft's method.
     SourceError
         No frame of val or cal passes the checks.
+    UsageError
+        Bonferroni's joint scope of a method that has a joint score.
     """
+    if draft.calibration.joint == "bonferroni" and HEADS[draft.method].one_joint_score:
+        raise UsageError(
+            f"joint: expected max for {draft.method}, which has one score for all six, found "
+            "bonferroni"
+        )
     first = with_candidate(draft, candidates[0])
     with Odometer(Bundle(first, model_bytes)) as odometer:
         val = observe(odometer, dataset, roles["val"])
@@ -144,20 +166,17 @@ def calibrated(
         }
     scored = with_candidate(draft, chosen(draft, val, candidates))
     head = HEADS[scored.method](scored)
-    cal_scores = head.scores(cal.outputs, cal.point, cal.truth)
-    val_scores = head.scores(val.outputs, val.point, val.truth)
+    cal_scores = cal.scored(head)
     source = scored.calibration
     return replace(
         scored,
-        thresholds=thresholds(
-            head, cal_scores, cal.sequence, val_scores, rule_of(scored), source.joint
-        ),
+        thresholds=thresholds(head, cal_scores, val.scored(head), rule_of(scored), source.joint),
         selftest=replace(scored.selftest, outputs=selftest),
         calibration=replace(
             source,
             n=len(cal.indices),
             n_sequences=len(np.unique(cal.sequence)),
-            n_effective=round(effective_frames(cal_scores, cal.sequence), 1),
+            n_effective=round(effective_frames(cal_scores), 1),
         ),
     )
 
@@ -239,36 +258,33 @@ def workspace(calibration: Calibration) -> tuple[Array, Array]:
 
 
 def thresholds(
-    head: Head,
-    cal_scores: Array,
-    cal_sequence: NDArray[np.int64],
-    val_scores: Array,
-    rule: Rule,
-    joint: Joint,
+    head: Head, cal: Scored, val: Scored, rule: Rule, joint: Joint
 ) -> tuple[Threshold, ...]:
-    """Both scopes at every confidence, from scores (n, sides, 6) on cal.
+    """Both scopes at every confidence, from scores on cal.
 
     ``pooled`` counts frames, ``hierarchical`` sequences; what too few of them cannot support is
     unbounded (null). Joint scope: ``max``, the largest score of a frame, made comparable on val;
-    or ``bonferroni``, six sets at a sixth of the miscoverage each.
+    or ``bonferroni``, six sets at a sixth of the miscoverage each. Scores that are one for all six
+    are equal and stay so.
     """
 
     def q_hat(scores: Array, confidence: float) -> float:
         if rule == "hierarchical":
-            return hierarchical_quantile(scores, cal_sequence, confidence)
+            return hierarchical_quantile(scores, cal.sequence, confidence)
         return conformal_quantile(scores, confidence)
 
-    scale = head.joint_scale(val_scores)
+    scale = head.joint_scale(val.joint)
     found = []
     for confidence in CONFIDENCES:
-        marginal = marginal_thresholds(head, cal_scores, confidence, q_hat)
+        marginal = marginal_thresholds(head, cal.marginal, confidence, q_hat)
         found.append(_threshold(confidence, "marginal", marginal))
         if joint == "bonferroni":
-            together = marginal_thresholds(head, cal_scores, 1.0 - (1.0 - confidence) / 6, q_hat)
+            each = 1.0 - (1.0 - confidence) / 6
+            together = marginal_thresholds(head, cal.marginal, each, q_hat)
         else:
             used = _used_sides(head)
-            largest = scale.comparable(cal_scores)[:, used].max(axis=(1, 2))
-            together = np.full(cal_scores.shape[1:], np.inf)
+            largest = scale.comparable(cal.joint)[:, used].max(axis=(1, 2))
+            together = np.full(cal.joint.shape[1:], np.inf)
             together[used] = scale.thresholds(q_hat(largest, confidence))[used]
         found.append(_threshold(confidence, "joint", together))
     return tuple(found)
@@ -293,16 +309,17 @@ def rule_of(calibration: Calibration) -> Rule:
     return rule
 
 
-def effective_frames(scores: Array, sequence: NDArray[np.int64]) -> float:
-    """Independent frames that scores (n, sides, 6) are worth: the least over all columns.
+def effective_frames(scored: Scored) -> float:
+    """Independent frames that marginal scores are worth: the least over all columns.
 
     Summed over sequences, which are independent of each other. An infinite score counts as the
     largest finite one.
     """
     columns = [
         np.minimum(column, column[np.isfinite(column)].max(initial=0.0))
-        for column in scores.reshape(len(scores), -1).T
+        for column in scored.marginal.reshape(len(scored.marginal), -1).T
     ]
+    sequence = scored.sequence
     return min(
         sum(effective_sample_size(column[sequence == number]) for number in np.unique(sequence))
         for column in columns

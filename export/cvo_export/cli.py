@@ -30,6 +30,7 @@ class MethodName(StrEnum):
     CJP = "cjp"
     CQR = "cqr"
     CSP = "csp"
+    MCQR = "mcqr"
     MC_DROPOUT = "mc-dropout"
     ENSEMBLE = "ensemble"
     GAUSSIAN = "gaussian"

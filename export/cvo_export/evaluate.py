@@ -22,6 +22,7 @@ from cvo_edge.pose import ConformalSet
 from cvo_export.calibrate import Observed, Rule, effective_frames, observe, thresholds, workspace
 from cvo_export.datasets import PoseDataset
 from cvo_export.splits import Split, same_split
+from cvo_export.volume import ellipsoids_volume
 
 Array = NDArray[np.float64]
 Subset = Literal["test", "all"]
@@ -120,8 +121,11 @@ def point_error(seen: Observed) -> dict[str, float]:
 def region_volume(region: ConformalSet, deviation: Array) -> float:
     """Volume of the region in which all six degrees of freedom lie, in standardised units.
 
-    ``deviation`` (6,): standard deviation of each degree of freedom's poses, m and rad.
+    The product of six sets, or a union of ellipsoids. ``deviation`` (6,): standard deviation of
+    each degree of freedom's poses, m and rad.
     """
+    if region.ellipsoids is not None:
+        return ellipsoids_volume(region.ellipsoids) / float(deviation.prod())
     return float((region.width() / deviation).prod())
 
 
@@ -227,13 +231,12 @@ def _level_lines(rule: str, levels: list[dict[str, Any]]) -> list[str]:
 def _recalibrated(
     odometer: Odometer, dataset: PoseDataset, split: Split, rule: Rule
 ) -> tuple[Threshold, ...]:
-    scores = []
-    for role in ("cal", "val"):
-        seen = observe(odometer, dataset, split.roles[role])
-        scores.append((odometer.head.scores(seen.outputs, seen.point, seen.truth), seen.sequence))
-    (cal_scores, cal_sequence), (val_scores, _) = scores
+    cal, val = (
+        observe(odometer, dataset, split.roles[role]).scored(odometer.head)
+        for role in ("cal", "val")
+    )
     joint = odometer.calibration.calibration.joint
-    return thresholds(odometer.head, cal_scores, cal_sequence, val_scores, rule, joint)
+    return thresholds(odometer.head, cal, val, rule, joint)
 
 
 @dataclass(frozen=True)
@@ -257,6 +260,11 @@ class _Sets:
         """Which true numbers lie in these sets, (n, 6)."""
         return np.array([r.covers(y) for r, y in zip(regions, self.seen.truth, strict=True)])
 
+    def covered_jointly(self, regions: list[ConformalSet]) -> float:
+        """Share of frames whose true numbers lie in these sets all six at once."""
+        pairs = zip(regions, self.seen.truth, strict=True)
+        return float(np.mean([region.contains(y) for region, y in pairs]))
+
     def level(self, entry: Threshold) -> dict[str, Any]:
         """Return the report's entry for one threshold."""
         regions = self.seen.regions(self.odometer.head, entry)
@@ -269,10 +277,7 @@ class _Sets:
         one_bound = len(used) < len(self.odometer.head.side_confidences(0.9))
         # A single bound is penalised by 1/alpha, an interval by 2/alpha.
         alpha = (1.0 - entry.confidence) * (2.0 if one_bound else 1.0)
-        nonconformity = self.odometer.head.scores(
-            self.seen.outputs, self.seen.point, self.seen.truth
-        )
-        effective_test = effective_frames(nonconformity, self.seen.sequence)
+        effective_test = effective_frames(self.seen.scored(self.odometer.head))
         # The band is that of one order statistic of frames: it says nothing of a rule that counts
         # sequences, of two thresholds a set, or of six that hold together by Bonferroni.
         finite = (
@@ -295,7 +300,7 @@ class _Sets:
             if finite
             else None,
             "coverage_band_exact": self.exact,
-            "joint_coverage": float(covered.all(axis=1).mean()),
+            "joint_coverage": self.covered_jointly(regions),
             **self.widths(limited, alpha),
             "unbounded_share": float(1.0 - bounded.mean()),
             **(self.volumes(limited) if entry.scope == "joint" else {}),
@@ -366,7 +371,8 @@ class _Sets:
             return {}
         head = self.odometer.head
         covered = self.covered(self.seen.regions(head, marginal))
-        jointly = np.asarray(self.covered(self.seen.regions(head, joint)).all(axis=1))
+        pairs = zip(self.seen.regions(head, joint), self.seen.truth, strict=True)
+        jointly = np.array([region.contains(y) for region, y in pairs])
         found = {}
         for number in np.unique(self.seen.sequence).tolist():
             rows = np.flatnonzero(np.equal(self.seen.sequence, number))

@@ -1,4 +1,4 @@
-"""The terms of the joint loss (the paper's Eq. 4 to 6), each beside its source.
+"""The terms of the losses (of the joint one: the paper's Eq. 4 to 6), each beside its source.
 
 All take standardised numbers of shape (batch, dof) and return a scalar.
 """
@@ -31,6 +31,12 @@ def interval_score_loss(lower: Tensor, upper: Tensor, y: Tensor, form: IntervalF
     """INTSCORE, Eq. 4 (Winkler 1972; Gneiting and Raftery 2007, eq. 43)."""
     outside = torch.relu(lower - y) + torch.relu(y - upper)
     return ((upper - lower) + _PENALTY[form] * outside).mean()
+
+
+def pinball_loss(quantile: Tensor, y: Tensor, tau: float) -> Tensor:
+    """Koenker and Bassett 1978: its minimiser is the tau quantile of y; any one shape -> scalar."""
+    above = y - quantile
+    return torch.maximum(tau * above, (tau - 1.0) * above).mean()
 
 
 def kl_divergence(mu: Tensor, log_variance: Tensor) -> Tensor:

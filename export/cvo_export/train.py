@@ -30,7 +30,7 @@ from cvo_export.backbone import Backbone, load_weights
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.features import FeatureExtractor, ModelImages, cached_copies
 from cvo_export.heads import Setting
-from cvo_export.heads.base import L, Learner
+from cvo_export.heads.base import Examples, L, Learner
 from cvo_export.methods import TRAINABLE
 from cvo_export.progress import Progress
 from cvo_export.run import History, PoseGraph, Run, TrainConfig, claim_run, open_run
@@ -154,6 +154,11 @@ class _Material:
             self._cached = {phase: (features, poses, torch.from_numpy(val))}
         return self._cached[phase]
 
+    def examples(self, phase: int) -> Examples:
+        """Features and standardised poses."""
+        features, poses, val = self.cached(phase)
+        return Examples(features, self.target.standardised(poses), val, self.val_y)
+
 
 class _Trainer:
     """The lessons of a run; see ``cvo_export.heads.base.Lessons``.
@@ -172,14 +177,21 @@ class _Trainer:
         self.history: list[History] = []
         self._material = material
 
-    def learn(self, name: str, build: Callable[[], L], rows: Indices | None = None) -> L:
+    def learn(
+        self,
+        name: str,
+        build: Callable[[], L],
+        rows: Indices | None = None,
+        examples: Examples | None = None,
+    ) -> L:
         """Train what ``build`` makes, with random numbers of its own name."""
         if self.fine_tuned and self.history:
             raise UsageError(f"fine-tune: expected a method of one lesson, found another, {name}")
         torch.manual_seed(_lesson_seed(self.setting.seed, name))
         learner = build()
-        everything = np.arange(len(self._material.images))
-        lesson = _Lesson(self._material, name, learner, everything if rows is None else rows)
+        if rows is None:
+            rows = np.arange(self.n_images if examples is None else examples.x.shape[1])
+        lesson = _Lesson(self._material, name, learner, rows, examples)
         self.history += lesson.fit()
         return learner
 
@@ -193,8 +205,8 @@ class _Trainer:
         return features, poses
 
     def val(self) -> tuple[Tensor, Array]:
-        """Features and standardised poses of val, by the backbone as learnt."""
-        return self._material.cached(self._last_phase)[2], self._material.val_y
+        """Features and poses of val, by the backbone as learnt."""
+        return self._material.cached(self._last_phase)[2], self._material.val_images.poses
 
     @property
     def _last_phase(self) -> int:
@@ -204,12 +216,20 @@ class _Trainer:
 class _Lesson:
     """The phases of a lesson: the head on cached features; with fine-tuning all, then it again."""
 
-    def __init__(self, material: _Material, name: str, learner: Learner, rows: Indices) -> None:
+    def __init__(
+        self,
+        material: _Material,
+        name: str,
+        learner: Learner,
+        rows: Indices,
+        examples: Examples | None,
+    ) -> None:
         self.material = material
         self.config = material.config
         self.name = name
         self.learner = learner
         self.rows = rows
+        self._examples = examples
         self.both = nn.ModuleDict({"backbone": material.backbone, "learner": learner})
         self.history: list[History] = []
         self._seed = _lesson_seed(self.config.seed, name)
@@ -230,13 +250,13 @@ class _Lesson:
     def _fit_head(self, phase: int, state: dict[str, Any] | None) -> None:
         """Train the head on features of augmented copies, computed by the present backbone."""
         if state is not None and state["ended"]:
-            self._keep(state["best"])
+            self._keep(phase, state["best"])
             return
-        features, poses, val = self.material.cached(phase)
+        examples = self._examples or self.material.examples(phase)
         if phase == 0:
-            self.learner.standardise.fit(features[:, self.rows])
-        x = torch.from_numpy(features)
-        y = torch.tensor(self.material.target.standardised(poses), dtype=torch.float32)
+            self.learner.standardise.fit(examples.x[:, self.rows])
+        x = torch.from_numpy(examples.x)
+        y = torch.tensor(examples.y, dtype=torch.float32)
 
         def batch(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
             copy = generator.integers(x.shape[0], size=self.config.batch_size)
@@ -245,6 +265,7 @@ class _Lesson:
 
         groups = [{"params": list(self.learner.parameters()), "peak": self.config.learning_rate}]
         with _one_thread():
+            val = examples.val_x, examples.val_y
             self._loop(phase, self.name, groups, self.config.steps, batch, lambda _: val, state)
 
     def _fit_all(self, phase: int, state: dict[str, Any] | None) -> None:
@@ -264,12 +285,13 @@ class _Lesson:
             stacked = torch.from_numpy(np.stack([image for image, _ in drawn]))
             return self.material.backbone(stacked), torch.tensor(y, dtype=torch.float32)
 
-        def val_features(averaged: nn.Module) -> Tensor:
+        def val(averaged: nn.Module) -> tuple[Tensor, Array]:
             with torch.no_grad():
                 backbone = averaged.get_submodule("backbone")
-                val = torch.from_numpy(val_images.images)
-                starts = range(0, len(val), _IMAGE_BATCH)
-                return torch.cat([backbone(val[i : i + _IMAGE_BATCH]) for i in starts])
+                images = torch.from_numpy(val_images.images)
+                starts = range(0, len(images), _IMAGE_BATCH)
+                features = [backbone(images[i : i + _IMAGE_BATCH]) for i in starts]
+            return torch.cat(features), self.material.val_y
 
         groups = [
             # The head is trained already: a full rate would undo it.
@@ -280,7 +302,7 @@ class _Lesson:
             },
         ]
         steps = self.config.fine_tune * math.ceil(self.rows.size / _IMAGE_BATCH)
-        self._loop(phase, "fine-tuning", groups, steps, batch, val_features, state)
+        self._loop(phase, "fine-tuning", groups, steps, batch, val, state)
 
     def _loop(
         self,
@@ -289,15 +311,16 @@ class _Lesson:
         groups: list[dict[str, Any]],
         steps: int,
         batch: Batch,
-        val_features: Callable[[nn.Module], Tensor],
+        val: Callable[[nn.Module], tuple[Tensor, Array]],
         state: dict[str, Any] | None,
     ) -> None:
-        """Run one phase; ``both`` ends with the averaged weights that were best on val."""
+        """Run one phase; what learns ends with the averaged weights that were best on val."""
         config = self.config
         optimiser = torch.optim.AdamW(groups, weight_decay=config.weight_decay)
         averaging = get_ema_multi_avg_fn(config.averaging)  # type: ignore[no-untyped-call]
-        averaged = AveragedModel(self.both, multi_avg_fn=averaging)
-        best: dict[str, Any] = {"score": math.inf, "weights": self.both.state_dict(), "count": 0}
+        learning = self._learning(phase)
+        averaged = AveragedModel(learning, multi_avg_fn=averaging)
+        best: dict[str, Any] = {"score": math.inf, "weights": learning.state_dict(), "count": 0}
         start = 0
         if state is not None:
             optimiser.load_state_dict(state["optimiser"])
@@ -317,12 +340,12 @@ class _Lesson:
             optimiser.zero_grad()
             value.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
-            averaged.update_parameters(self.both)
+            averaged.update_parameters(learning)
             if (step + 1) % every == 0 or step + 1 == steps:
                 module = averaged.module
                 learner = cast("Learner", module.get_submodule("learner")).eval()
                 with torch.no_grad():
-                    score = learner.val_score(val_features(module), self.material.val_y)
+                    score = learner.val_score(*val(module))
                 if score < best["score"]:
                     weights = {key: value.clone() for key, value in module.state_dict().items()}
                     best = {"score": score, "weights": weights, "count": 0}
@@ -332,10 +355,14 @@ class _Lesson:
                 ended = step + 1 == steps or best["count"] >= _PATIENCE
                 self._write_checkpoint(phase, step + 1, ended, optimiser, averaged, best)
                 self.material.progress(f"{what}, val score {score:.3f}", step + 1, steps)
-        self._keep(best)
+        self._keep(phase, best)
 
-    def _keep(self, best: dict[str, Any]) -> None:
-        self.both.load_state_dict(best["weights"])
+    def _learning(self, phase: int) -> nn.ModuleDict:
+        """What learns in a phase: averaging a frozen backbone would take as long as the head."""
+        return self.both if phase == 1 else nn.ModuleDict({"learner": self.learner})
+
+    def _keep(self, phase: int, best: dict[str, Any]) -> None:
+        self._learning(phase).load_state_dict(best["weights"])
         self.learner.eval()
 
     def _write_checkpoint(

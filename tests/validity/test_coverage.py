@@ -9,7 +9,7 @@ from cvo_edge.conformal import (
     conformal_rank,
     hierarchical_quantile,
 )
-from cvo_export.calibrate import thresholds
+from cvo_export.calibrate import Scored, thresholds
 
 REPEATS = 1000
 
@@ -123,6 +123,10 @@ def test_scores_are_at_most_the_threshold_in_rank_over_n_plus_one(
     assert abs(np.mean(covered) - expected) < 4.5 * standard_error(expected, n)
 
 
+def as_scored(scores):
+    return Scored(scores, scores, np.zeros(len(scores), np.int64))
+
+
 def coverages(head, n, joint="max"):
     """Per DoF and jointly: (marginal sets, their hulls, joint sets), means over all repeats."""
     outputs, point, truth = frames(REPEATS * (n + TRIALS) + 200, n)
@@ -132,7 +136,7 @@ def coverages(head, n, joint="max"):
     for repeat in range(REPEATS):
         start = repeat * (n + TRIALS)
         cal = scores[start : start + n]
-        entries = thresholds(head, cal, np.zeros(n, np.int64), val, "pooled", joint)
+        entries = thresholds(head, as_scored(cal), as_scored(val), "pooled", joint)
         by_scope = {e.scope: e for e in entries if e.confidence == CONFIDENCE}
         for row in range(start + n, start + n + JUDGED):
             one = {name: values[row : row + 1] for name, values in outputs.items()}

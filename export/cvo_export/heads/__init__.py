@@ -6,7 +6,7 @@ one line in each registry.
 
 from __future__ import annotations
 
-from cvo_export.heads import cjp, cqr, csp
+from cvo_export.heads import cjp, cqr, csp, mcqr
 from cvo_export.heads.base import ExportedHead, Lessons, Method, Setting
 
 __all__ = ["METHODS", "ExportedHead", "HeadConfig", "Lessons", "Method", "Setting"]
@@ -15,6 +15,7 @@ METHODS: dict[str, Method] = {
     "cjp": cjp.METHOD,
     "cqr": cqr.METHOD,
     "csp": csp.METHOD,
+    "mcqr": mcqr.METHOD,
 }
 
-HeadConfig = cjp.CjpConfig | cqr.CqrConfig | csp.CspConfig
+HeadConfig = cjp.CjpConfig | cqr.CqrConfig | csp.CspConfig | mcqr.McqrConfig

@@ -40,7 +40,7 @@ class Standardise(nn.Module):
         self.mean: Tensor
         self.std: Tensor
 
-    def fit(self, features: NDArray[np.float16]) -> None:
+    def fit(self, features: NDArray[np.float16] | NDArray[np.float32]) -> None:
         """Take mean and deviation from features (copies, n, size)."""
         deviation = features.std((0, 1), dtype=np.float64)
         self.mean.copy_(torch.from_numpy(features.mean((0, 1), dtype=np.float64)))
@@ -132,6 +132,19 @@ class Setting(NamedTuple):
     seed: int
 
 
+class Examples(NamedTuple):
+    """What a lesson learns from, where that is not the features.
+
+    Inputs (copies, n, size) and truths (copies, n, 6) of the training images in any number of
+    copies; inputs (n_val, size) and truths (n_val, 6) of val.
+    """
+
+    x: NDArray[np.float16] | NDArray[np.float32]
+    y: Array
+    val_x: Tensor
+    val_y: Array
+
+
 class Lessons(Protocol):
     """What the training loop offers to a method."""
 
@@ -142,8 +155,17 @@ class Lessons(Protocol):
     # Whether the backbone learns, too: then residuals on frames that it has seen are too small.
     fine_tuned: bool
 
-    def learn(self, name: str, build: Callable[[], L], rows: Indices | None = None) -> L:
-        """Train what ``build`` makes on these rows, all by default; kept and resumed by name."""
+    def learn(
+        self,
+        name: str,
+        build: Callable[[], L],
+        rows: Indices | None = None,
+        examples: Examples | None = None,
+    ) -> L:
+        """Train what ``build`` makes on these rows, all by default; kept and resumed by name.
+
+        On features and standardised poses, unless other ``examples`` are given.
+        """
 
     def folds(self, count: int) -> list[Indices]:
         """Rows of the training images, dealt into folds by the split's own unit."""
@@ -152,7 +174,7 @@ class Lessons(Protocol):
         """Poses (n, 7) of the training images."""
 
     def val(self) -> tuple[Tensor, Array]:
-        """Features (n_val, size) and standardised poses (n_val, 6) of val."""
+        """Features (n_val, size) and poses (n_val, 7) of val."""
 
     def features(self) -> tuple[NDArray[np.float16], Array]:
         """Features (copies + 1, n, size) and poses (copies + 1, n, 7); the first is unchanged."""

@@ -23,9 +23,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
-from cvo_edge.errors import UsageError
 from cvo_edge.heads.cqr import CqrParameters
-from cvo_edge.pose import Chart
 from cvo_export.calibrate import Candidate
 from cvo_export.forest import (
     ML_DOMAIN,
@@ -43,15 +41,18 @@ from cvo_export.heads.base import (
     Setting,
     half_width_floor,
 )
-from cvo_export.heads.point import PointLearner, PointNetwork
+from cvo_export.heads.point import (
+    PointNetwork,
+    Residuals,
+    compressed,
+    learn_held_out,
+    principal_components,
+    residuals_of,
+)
 from cvo_export.target import PoseDecoder
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
-# Fewer training frames than this are too few to set a part aside for the forest.
-_MANY_FRAMES = 1500
-_FOLDS = 3
 _LEAST_SCALE = 1e-6
 
 
@@ -86,7 +87,7 @@ class CqrConfig(Struct, frozen=True, tag="cqr", tag_field="method", forbid_unkno
     split_features: Annotated[float, Meta(gt=0, le=1)] = 1 / 3
     components: Annotated[int, Meta(ge=0, le=4096)] = 58
     forest: Literal["shared", "per_dof"] = "shared"
-    residuals: Literal["auto", "cross_fitted", "held_out"] = "auto"
+    residuals: Residuals = "auto"
     forest_copies: Annotated[int, Meta(ge=0)] = 3
     hidden: tuple[int, int] = (256, 128)
     feature_noise: float = 0.1
@@ -202,40 +203,19 @@ _ORIGIN = np.array([1, 1, 1, 0, 0, 0], dtype=np.float32)
 
 def _train(lessons: Lessons, config: CqrConfig) -> CqrHead:
     setting = lessons.setting
-    everything = np.arange(lessons.n_images)
-    cross_fitted = config.residuals == "cross_fitted"
-    if config.residuals == "auto":
-        cross_fitted = not lessons.fine_tuned and everything.size < _MANY_FRAMES
-    if cross_fitted and lessons.fine_tuned:
-        raise UsageError(
-            "residuals: expected held_out with a backbone that learns, too, found cross_fitted"
-        )
-
-    def learn(name: str, rows: Indices) -> PointNetwork:
-        size, hidden, noise = setting.feature_size, config.hidden, config.feature_noise
-        return lessons.learn(name, lambda: PointLearner(size, hidden, noise), rows).network
-
-    if cross_fitted:
-        rows, held_out = everything, lessons.folds(_FOLDS)
-        learned_on = [np.setdiff1d(everything, fold) for fold in held_out]
-        others = [learn(f"cqr-fold{i}", fold) for i, fold in enumerate(learned_on)]
-        network = learn("cqr", everything)
-    else:
-        rows = everything[lessons.n_train :]
-        network = learn("cqr", everything[: lessons.n_train])
-        held_out, others = [rows], [network]
+    held_out = learn_held_out(lessons, "cqr", config.residuals, config.hidden, config.feature_noise)
+    network, rows = held_out.network, held_out.rows
     features, poses = lessons.features()
     # Evenly over the grades; each once, where there are fewer copies than asked for.
     spread = np.linspace(0, len(features) - 1, config.forest_copies + 2)[:-1]
     copies = np.unique(spread.round().astype(int))
     features, poses = features[copies], poses[copies]
-    point = np.zeros((*features.shape[:2], DOF))
-    for fold, other in zip(held_out, others, strict=True):
-        point[:, fold] = _points(other, features[:, fold])
-    residual = _residuals(setting, point, poses)[:, rows].reshape(-1, DOF)
-    components = _principal_components(network, features[0], config.components)
-    compressed = _compressed(network, features, components)
-    x = np.concatenate([compressed, point.astype(np.float32)], axis=2)[:, rows]
+    point = held_out.points(features)
+    residual = residuals_of(setting, point, poses[:, rows]).reshape(-1, DOF)
+    components = principal_components(network, features[0], config.components)
+    x = np.concatenate(
+        [compressed(network, features[:, rows], components), point.astype(np.float32)], axis=2
+    )
     centred = np.abs(residual - np.median(residual, axis=0))
     scale = np.maximum(1.4826 * np.median(centred, axis=0), _LEAST_SCALE)
     columns = (
@@ -269,40 +249,3 @@ def _restore(setting: Setting, config: CqrConfig, state: Mapping[str, Tensor]) -
 
 
 METHOD = Method(CqrConfig, _train, _restore)
-
-
-def _points(network: PointNetwork, features: NDArray[np.float16]) -> Array:
-    """Features (copies, n, size) -> standardised points (copies, n, 6)."""
-    with torch.no_grad():
-        return np.stack([network(torch.from_numpy(f).float()).double().numpy() for f in features])
-
-
-def _residuals(setting: Setting, point: Array, poses: Array) -> Array:
-    """Standardised points (copies, n, 6) and true poses (copies, n, 7) -> residuals e."""
-    decoder = PoseDecoder(setting.target)
-    flat = torch.from_numpy(point.reshape(-1, DOF)).float()
-    predicted = decoder.pose(decoder(flat)).double().numpy()
-    chart = Chart("tangent_predicted")
-    truth = poses.reshape(-1, 7)
-    origin = chart.coordinates(predicted, predicted)
-    return np.asarray(chart.coordinates(truth, predicted) - origin).reshape(*point.shape)
-
-
-def _principal_components(
-    network: PointNetwork, features: NDArray[np.float16], count: int
-) -> Tensor:
-    """Features (n, size) -> directions of the greatest spread, standardised, (size, count)."""
-    with torch.no_grad():
-        x = network.standardise(torch.from_numpy(features).float()).double()
-    _, _, directions = torch.linalg.svd(x - x.mean(dim=0), full_matrices=False)
-    kept: Tensor = directions[:count].T.float().contiguous()
-    return kept
-
-
-def _compressed(
-    network: PointNetwork, features: NDArray[np.float16], components: Tensor
-) -> NDArray[np.float32]:
-    """Features (copies, n, size) -> principal components (copies, n, count)."""
-    with torch.no_grad():
-        found = [network.standardise(torch.from_numpy(f).float()) @ components for f in features]
-    return np.stack([values.numpy() for values in found])

@@ -268,7 +268,8 @@ def _train(lessons: Lessons, config: CspConfig) -> CspHead:
         )
 
     learners = [learn(sigma) for sigma in sigmas]
-    features, y = lessons.val()
+    features, poses = lessons.val()
+    y = setting.target.standardised(poses)
     with torch.no_grad():
         network = min(learners, key=lambda learner: learner.val_score(features, y)).network
         logits = network(features).double()

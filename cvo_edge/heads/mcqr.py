@@ -1,0 +1,134 @@
+"""Multivariate conformalized quantile regression (MCQR): one region for all six degrees of freedom.
+
+The model gives a codebook y_1 .. y_J, points that fill a 90 % region of the residual (directional
+quantiles in the latent space of a conditional variational autoencoder, Feldman, Bates and Romano
+2021, decoded along fixed rays), and a lower triangular scale matrix B, which says how errors of
+this frame spread and lean. The nonconformity score of a truth y is its scaled distance
+
+    s = min_j |B^-1 (y - y_j)|
+
+and the region {y : s(y) <= r} is a union of J ellipsoids, of any shape that the codebook has. Its
+hull [min_j y_jd - r |B_d|, max_j y_jd + r |B_d|], with |B_d| the norm of row d, holds all six
+degrees of freedom at once wherever the region holds the truth.
+
+That is the joint scope. Hulls that hold jointly are too wide for a single degree of freedom, so the
+marginal scope has six thresholds of conformalized quantile regression (``cvo_edge.heads.cqr``) on
+the raw hull, that of r = 1; ``calibration.score`` says whether they are added to it (``additive``)
+or are factors of its half-widths about its middle (``normalised``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from cvo_edge.artifact import Calibration, SixPositive, Threshold
+from cvo_edge.conformal import JointScale, LinearScale
+from cvo_edge.errors import CalibrationFileError
+from cvo_edge.heads.cqr import IntervalScore, infinite_where_null
+from cvo_edge.pose import ConformalSet, Ellipsoids, Scope, scaled_distance
+
+Array = NDArray[np.float64]
+
+_SCORES = ("normalised", "additive")
+
+
+class McqrParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """``method_parameters`` of an MCQR bundle.
+
+    ``points``: J, size of the codebook. ``half_width_floor``: least half-width per DoF (m, rad) of
+    the raw hull in the normalised score.
+    """
+
+    points: Annotated[int, Meta(ge=1, le=4096)]
+    half_width_floor: SixPositive
+
+
+class McqrHead:
+    """Score, region and intervals of multivariate conformalized quantile regression."""
+
+    parameters_type: ClassVar[type[Struct]] = McqrParameters
+    one_joint_score: ClassVar[bool] = True
+
+    def __init__(self, calibration: Calibration) -> None:
+        parameters = calibration.parameters(McqrParameters)
+        score = calibration.calibration.score
+        if score not in _SCORES:
+            raise CalibrationFileError(
+                f"calibration.score: expected one of {', '.join(_SCORES)} for mcqr, found {score!r}"
+            )
+        normalised = score == "normalised"
+        self._score = IntervalScore(np.array(parameters.half_width_floor) if normalised else None)
+        self.outputs: Mapping[str, tuple[int, ...]] = {
+            "pose": (1, 7),
+            "codebook": (1, parameters.points, 6),
+            "scale": (1, 6, 6),
+        }
+        for entry in calibration.thresholds:
+            if entry.q_hat_upper is not None:
+                raise CalibrationFileError(
+                    "thresholds.q_hat_upper: expected null for mcqr, found more"
+                )
+            radius = entry.q_hat[0]
+            if entry.scope == "joint" and not (
+                entry.q_hat == (radius,) * 6 and (radius is None or radius >= 0.0)
+            ):
+                raise CalibrationFileError(
+                    "thresholds.q_hat: expected one distance of at least 0, six times, for mcqr "
+                    f"and scope joint, found {list(entry.q_hat)}"
+                )
+
+    def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
+        """Nothing: the image is the only input."""
+        return {}
+
+    def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
+        """One threshold for the whole set."""
+        return (confidence,)
+
+    def joint_scale(self, scores: Array) -> JointScale:
+        """Nothing to compare: six times one distance."""
+        return LinearScale(np.ones(scores.shape[1:]))
+
+    def scores(
+        self,
+        outputs: Mapping[str, NDArray[Any]],
+        point: Array,
+        truth: Array,
+        scope: Scope = "marginal",
+    ) -> Array:
+        """Outputs stacked over n frames, truth (n, 6) -> scores (n, 1, 6); point is not needed.
+
+        Marginal: of each DoF against the raw hull. Joint: the scaled distance, six times.
+        """
+        codebook, scale = outputs["codebook"], outputs["scale"].astype(np.float64)
+        if scope == "joint":
+            distance = scaled_distance(codebook, scale, truth)
+            return np.tile(distance[:, np.newaxis, np.newaxis], (1, 1, 6))
+        extent = np.linalg.norm(scale, axis=2)
+        lower = codebook.min(axis=1).astype(np.float64) - extent
+        upper = codebook.max(axis=1).astype(np.float64) + extent
+        sides = self._score.sides(lower, upper, 0.5 * (lower + upper), truth)
+        return np.asarray(sides.max(axis=1, keepdims=True))
+
+    def region(
+        self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
+    ) -> ConformalSet:
+        """Outputs of one frame -> its region and hull, or six intervals; point is not needed."""
+        codebook = outputs["codebook"][0]
+        scale = outputs["scale"][0].astype(np.float64)
+        q_hat = infinite_where_null(threshold.q_hat)
+        lowest = codebook.min(axis=0).astype(np.float64)
+        highest = codebook.max(axis=0).astype(np.float64)
+        extent = np.sqrt((scale * scale).sum(axis=1))
+        if threshold.scope == "joint":
+            radius = float(q_hat[0])
+            reach = radius * extent
+            ellipsoids = Ellipsoids(codebook, scale, radius) if np.isfinite(radius) else None
+            return ConformalSet(lowest - reach, highest + reach, ellipsoids=ellipsoids)
+        lower, upper = lowest - extent, highest + extent
+        return self._score.inverse(lower, upper, 0.5 * (lower + upper), q_hat, q_hat)

@@ -1,0 +1,252 @@
+"""Multivariate conformalized quantile regression: a region for the residual of a point network.
+
+The paper's section IV-A. A point network gives the pose. From its compressed features and that pose
+(the condition c) an autoencoder with directional quantiles (``cvo_export.directional``) gives a
+region of its residual
+
+    e = (t - t_hat, Log(R_hat^T R))
+
+as a codebook of points, one static graph. Residuals come from frames that their network has not
+seen, as in CQR. The paper multiplies them by MC-dropout: stochastic passes of the point network,
+each with its own residual (``augmentation``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cvo_edge.errors import UsageError
+from cvo_edge.heads.mcqr import McqrParameters
+from cvo_export.calibrate import Candidate
+from cvo_export.directional import RegionConfig, RegionNetwork, best_kappa, mean_volume
+from cvo_export.heads.base import (
+    DOF,
+    Examples,
+    ExportedHead,
+    Learner,
+    Lessons,
+    Method,
+    Setting,
+    Standardise,
+    half_width_floor,
+)
+from cvo_export.heads.point import (
+    PointNetwork,
+    Residuals,
+    compressed,
+    learn_held_out,
+    principal_components,
+    residuals_of,
+)
+from cvo_export.target import PoseDecoder
+
+Array = NDArray[np.float64]
+
+# What early stopping looks at: one inflation, and few draws for the volume.
+_USUAL_KAPPA = 0.8
+_FEW_DRAWS = 100
+_LEAST_SCALE = 1e-6
+
+
+class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unknown_fields=True):
+    """The choices of the region and of its point network.
+
+    The paper's are augmentation predictions and scale constant.
+
+    Attributes
+    ----------
+    augmentation
+        What MC-dropout passes of the point network add to the region's training data: with
+        ``predictions`` each pass is a point of its own, with its own condition and residual; with
+        ``labels`` the condition stays that of the deterministic point; ``none``: no passes.
+    passes
+        Stochastic passes of each frame.
+    dropout
+        Behind the point network's last hidden layer, where there are passes.
+    components
+        Principal components of the features in the condition, beside the point's six numbers.
+    scale
+        ``local``: the codebook's unit is a matrix that the condition decides; ``constant``: the
+        spread of all residuals.
+    kappa
+        Inflation of the learned region; None lets val choose.
+    directions, rays
+        Directions whose quantiles are learned; rays of the codebook, with three points each.
+    tau
+        Level of the directional quantiles.
+    kl_weight
+        beta of the autoencoder.
+    condition_noise
+        Standard deviation of Gaussian noise on the standardised condition while training.
+    residuals
+        ``cross_fitted``, ``held_out``, or ``auto``: cross-fitted below 1500 training frames.
+    hidden, feature_noise
+        Of the point network, as in CQR.
+    """
+
+    augmentation: Literal["none", "predictions", "labels"] = "none"
+    passes: Annotated[int, Meta(ge=1, le=1000)] = 20
+    dropout: Annotated[float, Meta(gt=0, lt=1)] = 0.05
+    components: Annotated[int, Meta(ge=0, le=4096)] = 16
+    scale: Literal["local", "constant"] = "local"
+    kappa: Annotated[float, Meta(gt=0)] | None = None
+    directions: Annotated[int, Meta(ge=8, le=4096)] = 128
+    rays: Annotated[int, Meta(ge=1, le=256)] = 128
+    tau: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05
+    kl_weight: Annotated[float, Meta(ge=0)] = 0.01
+    condition_noise: Annotated[float, Meta(ge=0)] = 0.05
+    residuals: Residuals = "auto"
+    hidden: tuple[int, int] = (256, 128)
+    feature_noise: float = 0.1
+
+
+class RegionLearner(Learner):
+    """The region's networks on scaled residuals, given the condition."""
+
+    def __init__(self, config: McqrConfig) -> None:
+        super().__init__()
+        condition = config.components + DOF
+        self.standardise = Standardise(condition, config.condition_noise)
+        self.network = RegionNetwork(
+            RegionConfig(
+                response=DOF,
+                condition=condition,
+                directions=config.directions,
+                rays=config.rays,
+                tau=config.tau,
+                kl_weight=config.kl_weight,
+                local_scale=config.scale == "local",
+            )
+        )
+
+    def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
+        """Condition (n, components + 6), scaled residual (n, 6) -> scalar."""
+        return self.network.loss(self.standardise(features), y)
+
+    def val_score(self, features: Tensor, y: Array) -> float:
+        """Mean volume of the region at 90 %, to the power 1/6; the radius is taken on these frames.
+
+        Condition (n, components + 6) and scaled residuals (n, 6).
+        """
+        return mean_volume(self.network, self.standardise(features), y, _USUAL_KAPPA, _FEW_DRAWS)
+
+
+class McqrHead(ExportedHead):
+    """Features -> pose (n, 7), codebook (n, J, 6) and scale (n, 6, 6), in metres and radians.
+
+    Both in the chart about the prediction: codebook points are (t_hat, 0) + e.
+    """
+
+    output_names = ("pose", "codebook", "scale")
+    runtime_method = "mcqr"
+    rotation = "tangent_predicted"
+
+    def __init__(
+        self,
+        point: PointNetwork,
+        components: Tensor,
+        learner: RegionLearner,
+        unit: Tensor,
+        kappa: Tensor,
+        setting: Setting,
+    ) -> None:
+        super().__init__()
+        self.point = point
+        self.decoder = PoseDecoder(setting.target)
+        self.standardise = learner.standardise
+        self.region = learner.network
+        for name, values in (("components", components), ("unit", unit), ("kappa", kappa)):
+            self.register_buffer(name, values)
+        # Of the predicted position alone: a prediction's own rotation numbers are zero.
+        self.register_buffer("origin", torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
+        self.components: Tensor
+        self.unit: Tensor
+        self.kappa: Tensor
+        self.origin: Tensor
+        self._method_parameters = McqrParameters(
+            points=len(self.region.shells), half_width_floor=half_width_floor(setting.target)
+        )
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return pose, codebook and scale."""
+        point = self.point(features)
+        small = self.point.standardise(features) @ self.components
+        c = self.standardise(torch.cat([small, point], dim=1))
+        coordinates = self.decoder(point)
+        scale = self.unit[:, None] * self.region.scale(c)
+        codebook = self.region.codebook(c, self.kappa) @ scale.transpose(1, 2)
+        codebook = codebook + (coordinates * self.origin)[:, None]
+        return self.decoder.pose(coordinates), codebook, scale
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Normalised before additive, as for CQR: of the six intervals alone."""
+        return (
+            Candidate("normalised", self._method_parameters),
+            Candidate("additive", self._method_parameters),
+        )
+
+
+def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
+    if lessons.fine_tuned:
+        raise UsageError("fine-tune: expected none for mcqr, whose region has a lesson of its own")
+    setting, passes = lessons.setting, config.augmentation != "none"
+    held_out = learn_held_out(
+        lessons,
+        "mcqr",
+        config.residuals,
+        config.hidden,
+        config.feature_noise,
+        config.dropout if passes else 0.0,
+    )
+    network, rows = held_out.network, held_out.rows
+    features, poses = lessons.features()
+    components = principal_components(network, features[0], config.components)
+    small = compressed(network, features[:, rows], components)
+    known = point = held_out.points(features)
+    poses = poses[:, rows]
+    if passes:
+        point = held_out.passes(features, config.passes, setting.seed)
+        poses = np.tile(poses, (config.passes, 1, 1))
+        small = np.tile(small, (config.passes, 1, 1))
+        known = point
+        if config.augmentation == "labels":
+            known = np.tile(held_out.points(features), (config.passes, 1, 1))
+    residual = residuals_of(setting, point, poses)
+    centred = np.abs(residual - np.median(residual, axis=(0, 1)))
+    unit = np.maximum(1.4826 * np.median(centred, axis=(0, 1)), _LEAST_SCALE)
+    val_features, val_poses = lessons.val()
+    with torch.no_grad():
+        val_point = network(val_features)
+        val_small = network.standardise(val_features) @ components
+    val_residual = residuals_of(setting, val_point.double().numpy(), val_poses)
+    examples = Examples(
+        np.concatenate([small, known.astype(np.float32)], axis=2),
+        residual / unit,
+        torch.cat([val_small, val_point], dim=1),
+        val_residual / unit,
+    )
+    learner = lessons.learn("mcqr-region", lambda: RegionLearner(config), examples=examples)
+    with torch.no_grad():
+        val_c = learner.standardise(examples.val_x)
+    kappa = torch.tensor(config.kappa or best_kappa(learner.network, val_c, examples.val_y))
+    return McqrHead(network, components, learner, torch.from_numpy(unit).float(), kappa, setting)
+
+
+def _restore(setting: Setting, config: McqrConfig, state: Mapping[str, Tensor]) -> McqrHead:
+    dropout = config.dropout if config.augmentation != "none" else 0.0
+    point = PointNetwork(setting.feature_size, config.hidden, config.feature_noise, dropout)
+    head = McqrHead(
+        point, state["components"], RegionLearner(config), state["unit"], state["kappa"], setting
+    )
+    head.load_state_dict(state)
+    return head
+
+
+METHOD = Method(McqrConfig, _train, _restore)
