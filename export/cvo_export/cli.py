@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -160,6 +161,21 @@ DatasetArgument = Annotated[
     str, typer.Argument(help="FORMAT:PATH, e.g. 7scenes:scenes/redkitchen.", show_default=False)
 ]
 
+BackboneOption = Annotated[str, typer.Option(help="Any timm model.")]
+WeightsOption = Annotated[
+    str, typer.Option(help="timm (downloads), a safetensors file, or none (random, untrained).")
+]
+StagesOption = Annotated[
+    str, typer.Option(help="Strides of the stages used, e.g. 16 or 8,16; final: the last layer.")
+]
+GridOption = Annotated[
+    str, typer.Option(help="Rows x columns each stage is averaged to; 1x1: global mean.")
+]
+CopiesOption = Annotated[
+    int | None, typer.Option(min=0, help="Augmented copies of each training frame.")
+]
+StepsOption = Annotated[int | None, typer.Option(min=100, help="Steps of training the head.")]
+
 
 @app.command()
 def train(
@@ -175,18 +191,10 @@ def train(
         Path,
         typer.Argument(help="New folder; or one to go on with, same options.", show_default=False),
     ],
-    backbone: Annotated[str, typer.Option(help="Any timm model.")] = "mobilenetv2_100",
-    weights: Annotated[
-        str,
-        typer.Option(help="timm (downloads), a safetensors file, or none (random, untrained)."),
-    ] = "timm",
-    stages: Annotated[
-        str,
-        typer.Option(help="Strides of the stages used, e.g. 16 or 8,16; final: the last layer."),
-    ] = "16",
-    grid: Annotated[
-        str, typer.Option(help="Rows x columns each stage is averaged to; 1x1: global mean.")
-    ] = "3x4",
+    backbone: BackboneOption = "mobilenetv2_100",
+    weights: WeightsOption = "timm",
+    stages: StagesOption = "16",
+    grid: GridOption = "3x4",
     normalisation: Annotated[
         NormalisationName | None,
         typer.Option(help="Pixel scaling; half (x - 127.5)/127.5 for a file, timm for timm's."),
@@ -198,9 +206,7 @@ def train(
         typer.Option(help="sequence where there are five or more, else block."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides split, training and noise.")] = 0,
-    copies: Annotated[
-        int | None, typer.Option(min=0, help="Augmented copies of each training frame.")
-    ] = None,
+    copies: CopiesOption = None,
     rotation_deg: Annotated[
         float | None, typer.Option(min=0, help="Camera turns of the copies, deviation per axis.")
     ] = None,
@@ -210,7 +216,7 @@ def train(
     fine_tune: Annotated[
         int | None, typer.Option(min=0, help="Epochs of training the backbone, too; 0: frozen.")
     ] = None,
-    steps: Annotated[int | None, typer.Option(min=100, help="Steps of training the head.")] = None,
+    steps: StepsOption = None,
     cache: Annotated[
         Path | None,
         typer.Option(help="Folder of features that several runs share; else in the run's."),
@@ -464,6 +470,65 @@ def evaluate(
         print(*table(report), sep="\n")
     if min_coverage is not None:
         check_coverage(report, min_coverage)
+
+
+@app.command()
+def compare(
+    dataset: DatasetArgument,
+    out: Annotated[Path, typer.Argument(help="Folder of the comparison; or one to go on with.")],
+    methods: Annotated[
+        str | None, typer.Option(help="Names with commas; all methods and baselines by default.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="How many, from 0 on.")] = 3,
+    split: Annotated[
+        SplitName | None,
+        typer.Option(help="sequence where there are five or more, else block."),
+    ] = None,
+    backbone: BackboneOption = "mobilenetv2_100",
+    weights: WeightsOption = "timm",
+    stages: StagesOption = "16",
+    grid: GridOption = "3x4",
+    steps: StepsOption = None,
+    copies: CopiesOption = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Runs at a time; all allowed cores by default.")
+    ] = None,
+    cache: Annotated[
+        Path | None, typer.Option(help="Folder of features; by default in OUT.")
+    ] = None,
+) -> None:
+    """Train, publish and evaluate methods and baselines over seeds, and time their frames.
+
+    Interrupted, the same command goes on. OUT gets compare.json and the table compare.txt.
+    """
+    from cvo_export.compare import compare as compare_methods
+    from cvo_export.methods import TRAINABLE
+
+    options = {
+        "dataset": dataset,
+        "split": split.value if split else None,
+        "size": "256x192",
+        "crop": "none",
+        "backbone": backbone,
+        "weights": weights,
+        "stages": stages,
+        "grid": grid,
+        "normalisation": None,
+        "steps": steps,
+        "copies": copies,
+    }
+    with show_progress() as progress:
+        lines = compare_methods(
+            out,
+            options,
+            list(TRAINABLE) if methods is None else methods.split(","),
+            seeds,
+            jobs=jobs,
+            cache=cache,
+            progress=progress,
+            say=partial(print, file=sys.stderr, flush=True),
+        )
+    print(*lines, sep="\n")
 
 
 @app.command()

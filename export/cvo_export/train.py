@@ -27,14 +27,14 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cvo_edge.errors import UsageError
 from cvo_export.backbone import Backbone, load_weights
-from cvo_export.datasets import PoseDataset
+from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.features import FeatureExtractor, ModelImages, cached_copies
 from cvo_export.heads import Setting
 from cvo_export.heads.base import Examples, L, Learner
 from cvo_export.methods import TRAINABLE
 from cvo_export.progress import Progress
 from cvo_export.run import History, PoseGraph, Run, TrainConfig, claim_run, open_run
-from cvo_export.splits import deal_folds
+from cvo_export.splits import Split, deal_folds, make_split
 from cvo_export.target import Target, fit_target
 
 Array = NDArray[np.float64]
@@ -64,14 +64,18 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     torch.manual_seed(config.seed)
     backbone = Backbone(config.backbone, config.height, config.width)
     weights_sha256 = load_weights(backbone, config.weights)
-    indices = np.concatenate([split.roles["train"], split.roles["fit"]])
+    indices = _training_frames(split)
     target = fit_target(dataset.poses[indices])
     claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
+    # Random weights are the run's own.
+    features_folder = run_dir / f"{FEATURES_FOLDER}-0"
+    if cache is not None and weights_sha256 is not None:
+        features_folder = _shared_folder(cache, config, weights_sha256, dataset, indices)
     trainer = _Trainer(
         _Material(
             run_dir,
-            _features_folder(run_dir, cache, config, weights_sha256, dataset, indices),
+            features_folder,
             config,
             backbone,
             target,
@@ -87,6 +91,28 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     run = Run(config, dataset, split, target, graph, weights_sha256, trainer.history)
     run.save(run_dir)
     return run
+
+
+def prepare_features(config: TrainConfig, cache: Path, progress: Progress) -> None:
+    """Compute the features that runs of this configuration share, so that each finds them.
+
+    Features of random weights are a run's own: then nothing is done.
+    """
+    dataset = open_dataset(config.dataset)
+    indices = _training_frames(make_split(dataset, config.split, config.seed))
+    backbone = Backbone(config.backbone, config.height, config.width)
+    weights_sha256 = load_weights(backbone, config.weights)
+    if weights_sha256 is None:
+        return
+    cached_copies(
+        _shared_folder(cache, config, weights_sha256, dataset, indices),
+        ModelImages(dataset, indices, config.height, config.width, config.crop),
+        FeatureExtractor(backbone, config.height, config.width),
+        config.augment,
+        config.copies,
+        config.seed,
+        progress,
+    )
 
 
 @dataclass
@@ -114,6 +140,7 @@ class _Material:
         if phase not in self._cached:
             config = self.config
             extractor = FeatureExtractor(self.backbone, config.height, config.width)
+            val = np.stack([extractor(image) for image in self.val_images.images])
             features, poses = cached_copies(
                 # A backbone that has learnt is this run's alone.
                 self.run_dir / f"{FEATURES_FOLDER}-{phase}" if phase else self.features_folder,
@@ -124,7 +151,6 @@ class _Material:
                 config.seed,
                 self.progress,
             )
-            val = np.stack([extractor(image) for image in self.val_images.images])
             self._cached = {phase: (features, poses, torch.from_numpy(val))}
         return self._cached[phase]
 
@@ -375,21 +401,17 @@ class _Lesson:
         return state
 
 
-def _features_folder(
-    run_dir: Path,
-    cache: Path | None,
-    config: TrainConfig,
-    weights_sha256: str | None,
-    dataset: PoseDataset,
-    indices: Indices,
-) -> Path:
-    """Where the pretrained network's features of these frames are kept.
+def _training_frames(split: Split) -> Indices:
+    return np.concatenate([split.roles["train"], split.roles["fit"]])
 
-    In a shared cache the name is a digest of everything that decides them, but for the pixels.
+
+def _shared_folder(
+    cache: Path, config: TrainConfig, weights_sha256: str, dataset: PoseDataset, indices: Indices
+) -> Path:
+    """Where the pretrained network's features of these frames are kept in a shared cache.
+
+    The name is a digest of everything that decides them, but for the pixels.
     """
-    # Random weights are the run's own.
-    if cache is None or weights_sha256 is None:
-        return run_dir / f"{FEATURES_FOLDER}-0"
     decisive = {
         "weights": weights_sha256,
         "backbone": msgspec.to_builtins(config.backbone),

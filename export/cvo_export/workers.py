@@ -1,0 +1,103 @@
+"""Tasks beside each other, each in a process of its own with one thread."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+
+from cvo_edge.errors import CvoError, SinkError
+
+Task = Callable[[], None]
+# Name of a task that has ended, and what went wrong.
+Ended = Callable[[str, CvoError | None], None]
+
+
+class TaskError(CvoError):
+    """A task ended by a defect, or its process was killed."""
+
+
+def run_tasks(tasks: Mapping[str, Task], jobs: int, ended: Ended) -> None:
+    """Run tasks by name, ``jobs`` at a time; one that fails does not keep the others from running.
+
+    A single one at a time runs in this process. Tasks are sent to processes, so they must pickle.
+    No process outlives this call.
+    """
+    if jobs > 1:
+        _in_processes(tasks, jobs, ended)
+    else:
+        for name, task in tasks.items():
+            ended(name, _attempt(task))
+
+
+def _in_processes(tasks: Mapping[str, Task], jobs: int, ended: Ended) -> None:
+    context = multiprocessing.get_context("spawn")
+    waiting = list(tasks.items())
+    running: dict[Connection, tuple[str, SpawnProcess]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                name, task = waiting.pop(0)
+                receiver, sender = context.Pipe(duplex=False)
+                process = context.Process(target=_worker, args=(sender, task), daemon=True)
+                with _interrupts_ignored():
+                    process.start()
+                running[receiver] = (name, process)
+                # The process alone holds it now: its death is seen here as the pipe's end.
+                sender.close()
+            ready = wait(list(running))
+            for receiver in [receiver for receiver in running if receiver in ready]:
+                name, process = running.pop(receiver)
+                ended(name, _outcome(receiver, process))
+    finally:
+        for _, process in running.values():
+            process.terminate()
+        for _, process in running.values():
+            process.join()
+
+
+def _outcome(receiver: Connection, process: SpawnProcess) -> CvoError | None:
+    try:
+        found: CvoError | None = receiver.recv()
+    except EOFError:
+        process.join()
+        return TaskError(f"its process ended with exit code {process.exitcode}")
+    finally:
+        receiver.close()
+    process.join()
+    return found
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """A process started here leaves SIGINT to its parent, which ends it."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _worker(sender: Connection, task: Task) -> None:
+    import torch
+
+    torch.set_num_threads(1)
+    sender.send(_attempt(task))
+
+
+def _attempt(task: Task) -> CvoError | None:
+    """Run a task; returns what went wrong."""
+    try:
+        task()
+    except CvoError as error:
+        return error
+    except OSError as error:
+        return SinkError(f"{error.filename or 'output'}: {error.strerror}")
+    except Exception as error:  # noqa: BLE001 - the other tasks go on
+        traceback.print_exc()
+        return TaskError(" ".join(f"{type(error).__name__}: {error}".split()))
+    return None
