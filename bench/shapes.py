@@ -26,9 +26,10 @@ from torch import Tensor, nn
 
 from cvo_edge.conformal import conformal_quantile
 from cvo_export.directional import (
+    Choice,
     RegionConfig,
     RegionNetwork,
-    best_kappa,
+    best_choice,
     scaled_distances,
 )
 from cvo_export.evaluate import coverage_band
@@ -92,8 +93,8 @@ def trained(module: M, loss: Callable[[M, Tensor, Tensor], Tensor], x: Array, y:
 class Regions:
     """Our calibrated regions, or with ``grid`` the paper's: points of a latent grid."""
 
-    def __init__(self, network: RegionNetwork, kappa: float, *, grid: bool) -> None:
-        self.network, self.kappa, self.grid = network, kappa, grid
+    def __init__(self, network: RegionNetwork, choice: Choice, *, grid: bool) -> None:
+        self.network, self.choice, self.grid = network, choice, grid
         self.radius = math.inf
 
     @torch.no_grad()
@@ -106,7 +107,8 @@ class Regions:
             codebook = grid.double().numpy()
             used = [p[use] for p, use in zip(codebook, inside.numpy(), strict=True)]
             return codebook, scale, used
-        codebook = self.network.codebook(c, torch.tensor(self.kappa)).double().numpy()
+        codebook = self.network.codebook(c, torch.tensor(self.choice.kappa)).double().numpy()
+        codebook = codebook[:, self.choice.points]
         return codebook, scale, list(codebook)
 
     def scores(self, x: Array, y: Array) -> Array:
@@ -157,7 +159,9 @@ def learned(x: Array, y: Array, val: tuple[Array, Array]) -> dict[str, Regions |
     """Train the region networks and the boxes' on x (n, 1), y (n, d)."""
     d = y.shape[1]
     network = trained(RegionNetwork(RegionConfig(d, 1)), lambda net, c, t: net.loss(c, t), x, y)
-    kappa = best_kappa(network, torch.tensor(val[0]).float(), val[1])
+    choice = best_choice(
+        network, (torch.tensor(x).float(), y), (torch.tensor(val[0]).float(), val[1])
+    )
 
     def outer_quantiles(box: nn.Module, c: Tensor, t: Tensor) -> Tensor:
         lower, upper = box(c).chunk(2, dim=1)
@@ -169,8 +173,8 @@ def learned(x: Array, y: Array, val: tuple[Array, Array]) -> dict[str, Regions |
         nn.Linear(64, 2 * d),
     )
     return {
-        "region": Regions(network, kappa, grid=False),
-        "grid": Regions(network, kappa, grid=True),
+        "region": Regions(network, choice, grid=False),
+        "grid": Regions(network, choice, grid=True),
         "box": Boxes(trained(box, outer_quantiles, x, y)),
     }
 
@@ -192,7 +196,8 @@ def study(name: str, d: int, seed: int, picture: Path | None) -> dict[str, Any]:
             "coverage": float((regions.scores(x, y) <= regions.radius).mean()),
             "mean_area": float(regions.areas(x[:200]).mean()),
         }
-    found["kappa"] = cast("Regions", sets["region"]).kappa
+    choice = cast("Regions", sets["region"]).choice
+    found["kappa"], found["points"] = choice.kappa, len(choice.points)
     found["area_ratio"] = found["box"]["mean_area"] / found["region"]["mean_area"]
     if picture is not None:
         draw(name, d, sets, picture)
@@ -255,7 +260,8 @@ def main() -> None:
                 )
                 print(
                     f"{name} {d}-D seed {seed}: coverage, mean area: {cells}; box / region "
-                    f"{found['area_ratio']:.2f}; kappa {found['kappa']:g}",
+                    f"{found['area_ratio']:.2f}; kappa {found['kappa']:g}, "
+                    f"{found['points']} points",
                     flush=True,
                 )
     if arguments.json:

@@ -7,9 +7,10 @@ import torch
 from cvo_edge.conformal import conformal_quantile
 from cvo_export.directional import (
     SHELLS,
+    Choice,
     RegionConfig,
     RegionNetwork,
-    best_kappa,
+    best_choice,
     fibonacci_sphere,
     mean_volume,
     scaled_distances,
@@ -126,8 +127,10 @@ def test_a_region_of_two_pieces_covers_them_and_little_of_the_gap():
     with torch.no_grad():
         x, y = two_pieces(500, generator)
         c = torch.tensor(x).float()
-        kappa = best_kappa(network, c, y)
-        codebook, scale = network.codebook(c, torch.tensor(kappa)), network.scale(c)
+        choice = best_choice(network, (c, y), (c, y))
+        network.keep(torch.from_numpy(choice.points))
+        codebook, scale = network.codebook(c, torch.tensor(choice.kappa)), network.scale(c)
+    assert codebook.shape == (500, len(choice.points), 2)
     codebook, scale = codebook.double().numpy(), scale.double().numpy()
     scores = scaled_distances(codebook, scale, y)
     radius = conformal_quantile(scores[:400], 0.9)
@@ -153,4 +156,15 @@ def test_the_mean_volume_is_in_units_of_the_response():
     network = fitted(two_pieces, steps=30)
     x, y = two_pieces(60, np.random.default_rng(3))
     c = torch.tensor(x).float()
-    assert mean_volume(network, c, y, 0.8) > mean_volume(network, c, 0.1 * y, 0.8)
+    usual = Choice(0.8, np.arange(385))
+    assert mean_volume(network, c, y, usual) > mean_volume(network, c, 0.1 * y, usual)
+
+
+def test_points_that_no_response_is_near_are_left_out():
+    network = fitted(two_pieces)
+    x, y = two_pieces(2000, np.random.default_rng(4))
+    c = torch.tensor(x).float()
+    chosen = best_choice(network, (c, y), (c[:300], y[:300]))
+    everything = Choice(chosen.kappa, np.arange(385))
+    assert 0 < len(chosen.points) < 385
+    assert mean_volume(network, c, y, chosen) < mean_volume(network, c, y, everything)
