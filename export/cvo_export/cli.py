@@ -197,7 +197,7 @@ def train(
     method: Annotated[
         MethodName,
         typer.Argument(
-            help="Conformal method (cjp, cqr, csp); the others are baselines to compare with.",
+            help="Conformal method (cjp, cqr, csp, mcqr); the others are baselines.",
             show_default=False,
         ),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,6 +16,10 @@ from cvo_edge.errors import CvoError, SinkError
 Task = Callable[[], None]
 # Name of a task that has ended, and what went wrong.
 Ended = Callable[[str, CvoError | None], None]
+
+
+# A call into a library ends before a process can unwind.
+_SECONDS_TO_LEAVE = 10.0
 
 
 class TaskError(CvoError):
@@ -57,6 +62,8 @@ def _in_processes(tasks: Mapping[str, Task], jobs: int, ended: Ended) -> None:
         for _, process in running.values():
             process.terminate()
         for _, process in running.values():
+            process.join(_SECONDS_TO_LEAVE)
+            process.kill()
             process.join()
 
 
@@ -85,6 +92,8 @@ def _interrupts_ignored() -> Iterator[None]:
 def _worker(sender: Connection, task: Task) -> None:
     import torch
 
+    # Unwind, so that half of a bundle or a semaphore is not left behind.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     torch.set_num_threads(1)
     sender.send(_attempt(task))
 

@@ -71,6 +71,8 @@ def test_no_process_is_left_behind_by_a_signal(tmp_path, number):
     )
     code = (
         "import signal, sys; from functools import partial\n"
+        # What starts the tests may have it ignored.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from cvo_export.workers import run_tasks\n"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))\n"
         f"tasks = {{name: partial(exec, {sleep!r}) for name in 'abc'}}\n"
