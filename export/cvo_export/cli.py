@@ -276,7 +276,7 @@ def train(
         int | None,
         typer.Option(
             min=0,
-            help="cqr, mcqr: principal components of the features, 58, 16; mdn: Gaussians, 5.",
+            help="cqr, mcqr: principal components of the features, 58, 16; mdn: Gaussians, 3.",
         ),
     ] = None,
     forest: Annotated[
@@ -318,7 +318,7 @@ def train(
     ] = None,
     dropout: Annotated[
         float | None,
-        typer.Option(min=0, max=0.99, help="mc-dropout: rate, 0.1; mcqr: 0.05; cjp, csp: 0."),
+        typer.Option(min=0, max=0.99, help="mc-dropout: rate, 0.01; mcqr: 0.05; cjp, csp: 0."),
     ] = None,
 ) -> None:
     """Train a method on a data set; interrupted, the same command goes on.
