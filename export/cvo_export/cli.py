@@ -318,7 +318,9 @@ def train(
     ] = None,
     dropout: Annotated[
         float | None,
-        typer.Option(min=0, max=0.99, help="mc-dropout: rate, 0.01; mcqr: 0.05; cjp, csp: 0."),
+        typer.Option(
+            min=0, max=0.99, help="mc-dropout: rate, 0.01; mcqr: 0.05 with passes; cjp, csp: 0."
+        ),
     ] = None,
 ) -> None:
     """Train a method on a data set; interrupted, the same command goes on.

@@ -199,6 +199,8 @@ def test_an_option_of_another_method_is_refused():
         ("cqr", {"quantiles": (0.0, 0.9)}, "0 < low < high < 1"),
         ("cqr", {"trees": 0}, "trees"),
         ("csp", {"classes": 1}, "classes"),
+        ("mcqr", {"augmentation": "labels", "dropout": 0.0}, "dropout: expected more than 0"),
+        ("mcqr", {"kappa": 0.0}, "kappa"),
         ("nothing", {}, "expected one of cjp, cqr, csp"),
     ],
 )
@@ -372,7 +374,7 @@ def test_passes_are_extra_training_data_and_never_count_as_frames(runs):
     _, run, bundle = runs("mcqr")
     calibration = read_calibration(bundle)
     assert calibration.calibration.n == run.split.roles["cal"].size
-    assert run.graph.head.point.dropout == CONFIGS["mcqr"].dropout
+    assert run.graph.head.point.dropout == 0.05
 
 
 def test_the_mean_of_many_passes_is_the_network_itself():

@@ -61,6 +61,7 @@ _FEW_DRAWS = 100
 # Training rows that show which points of the codebook are of use.
 _USAGE_ROWS = 4000
 _LEAST_SCALE = 1e-6
+_DROPOUT = 0.05
 
 
 class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unknown_fields=True):
@@ -77,7 +78,7 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
     passes
         Stochastic passes of each frame.
     dropout
-        Behind the point network's last hidden layer, where there are passes.
+        Behind the point network's last hidden layer; None: 0.05 where there are passes, else 0.
     components
         Principal components of the features in the condition, beside the point's six numbers.
     scale
@@ -101,7 +102,7 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
 
     augmentation: Literal["none", "predictions", "labels"] = "none"
     passes: Annotated[int, Meta(ge=1, le=1000)] = 20
-    dropout: Annotated[float, Meta(gt=0, lt=1)] = 0.05
+    dropout: Annotated[float, Meta(ge=0, lt=1)] | None = None
     components: Annotated[int, Meta(ge=0, le=4096)] = 16
     scale: Literal["local", "constant"] = "local"
     kappa: Annotated[float, Meta(gt=0)] | None = None
@@ -113,6 +114,20 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
     residuals: Residuals = "auto"
     hidden: tuple[int, int] = (256, 128)
     feature_noise: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse passes that are all the same."""
+        if self.augmentation != "none" and self.dropout == 0.0:
+            raise ValueError(
+                f"dropout: expected more than 0 for the passes of {self.augmentation}, found 0"
+            )
+
+    @property
+    def point_dropout(self) -> float:
+        """Dropout of the point network."""
+        if self.dropout is not None:
+            return self.dropout
+        return 0.0 if self.augmentation == "none" else _DROPOUT
 
 
 class RegionLearner(Learner):
@@ -216,7 +231,7 @@ def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
         config.residuals,
         config.hidden,
         config.feature_noise,
-        config.dropout if passes else 0.0,
+        config.point_dropout,
     )
     network, rows = held_out.network, held_out.rows
     features, poses = lessons.features()
@@ -273,8 +288,9 @@ def _choice(learner: RegionLearner, examples: Examples, config: McqrConfig, seed
 
 
 def _restore(setting: Setting, config: McqrConfig, state: Mapping[str, Tensor]) -> McqrHead:
-    dropout = config.dropout if config.augmentation != "none" else 0.0
-    point = PointNetwork(setting.feature_size, config.hidden, config.feature_noise, dropout)
+    point = PointNetwork(
+        setting.feature_size, config.hidden, config.feature_noise, config.point_dropout
+    )
     learner = RegionLearner(config)
     learner.network.keep(state["points"])
     head = McqrHead(
