@@ -4,7 +4,7 @@ PYTHON ?= python3
 TORCH_PIP_OPTIONS ?=
 VENV := .venv
 DEMO_VENV := .venv-demo
-METHODS := cjp cqr csp
+METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 CLIP := calibration_artifacts/synthetic-room-clip
 

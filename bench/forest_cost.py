@@ -19,8 +19,7 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-import onnx
-from onnx.utils import Extractor
+from uncertainty_cost import pose_alone
 
 from cvo_edge import preprocess
 from cvo_edge.artifact import read_bundle
@@ -40,13 +39,6 @@ session = Session(content)
 after = memory_mib()
 print(after["rss"] - before["rss"], after["peak_rss"] - before["peak_rss"])
 """
-
-
-def without_forest(model_bytes: bytes) -> bytes:
-    """Return the part of the model that gives the pose alone."""
-    extractor = Extractor(onnx.load_from_string(model_bytes))
-    part: bytes = extractor.extract_model(["image"], ["pose"]).SerializeToString()
-    return part
 
 
 def load_mib(model_bytes: bytes) -> list[float]:
@@ -78,7 +70,7 @@ def main() -> None:
         for image in map(preprocess.to_bgr8, images)
         if image is not None
     ]
-    cut = without_forest(bundle.model_bytes)
+    cut = pose_alone(bundle.model_bytes)
     whole, point = Session(bundle.model_bytes), Session(cut)
     spent: dict[str, list[float]] = {"whole": [], "without": [], "step": []}
     with Odometer(bundle) as odometer:

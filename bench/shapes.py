@@ -26,9 +26,10 @@ from torch import Tensor, nn
 
 from cvo_edge.conformal import conformal_quantile
 from cvo_export.directional import (
+    Choice,
     RegionConfig,
     RegionNetwork,
-    best_kappa,
+    best_choice,
     scaled_distances,
 )
 from cvo_export.evaluate import coverage_band
@@ -92,8 +93,8 @@ def trained(module: M, loss: Callable[[M, Tensor, Tensor], Tensor], x: Array, y:
 class Regions:
     """Our calibrated regions, or with ``grid`` the paper's: points of a latent grid."""
 
-    def __init__(self, network: RegionNetwork, kappa: float, *, grid: bool) -> None:
-        self.network, self.kappa, self.grid = network, kappa, grid
+    def __init__(self, network: RegionNetwork, choice: Choice, *, grid: bool) -> None:
+        self.network, self.choice, self.grid = network, choice, grid
         self.radius = math.inf
 
     @torch.no_grad()
@@ -106,13 +107,18 @@ class Regions:
             codebook = grid.double().numpy()
             used = [p[use] for p, use in zip(codebook, inside.numpy(), strict=True)]
             return codebook, scale, used
-        codebook = self.network.codebook(c, torch.tensor(self.kappa)).double().numpy()
+        codebook = self.network.codebook(c, torch.tensor(self.choice.kappa)).double().numpy()
+        codebook = codebook[:, self.choice.points]
         return codebook, scale, list(codebook)
 
     def scores(self, x: Array, y: Array) -> Array:
-        """Scaled distances (n,) of y (n, d); in parts, as a grid has 4096 points."""
-        parts = np.array_split(np.arange(len(x)), math.ceil(len(x) / 100))
-        return np.concatenate([scaled_distances(*self.points(x[r])[:2], y[r]) for r in parts])
+        """Scaled distances (n,) of y (n, d) at x (n, 1) or at one x (1, 1)."""
+        at_one = self.points(x)[:2] if len(x) == 1 else None
+        # In parts, as a grid has 4096 points.
+        parts = np.array_split(np.arange(len(y)), math.ceil(len(y) / 200))
+        return np.concatenate(
+            [scaled_distances(*(at_one or self.points(x[rows])[:2]), y[rows]) for rows in parts]
+        )
 
     def areas(self, x: Array) -> Array:
         """Area or volume of the region at each condition (n, 1)."""
@@ -153,7 +159,9 @@ def learned(x: Array, y: Array, val: tuple[Array, Array]) -> dict[str, Regions |
     """Train the region networks and the boxes' on x (n, 1), y (n, d)."""
     d = y.shape[1]
     network = trained(RegionNetwork(RegionConfig(d, 1)), lambda net, c, t: net.loss(c, t), x, y)
-    kappa = best_kappa(network, torch.tensor(val[0]).float(), val[1])
+    choice = best_choice(
+        network, (torch.tensor(x).float(), y), (torch.tensor(val[0]).float(), val[1])
+    )
 
     def outer_quantiles(box: nn.Module, c: Tensor, t: Tensor) -> Tensor:
         lower, upper = box(c).chunk(2, dim=1)
@@ -165,8 +173,8 @@ def learned(x: Array, y: Array, val: tuple[Array, Array]) -> dict[str, Regions |
         nn.Linear(64, 2 * d),
     )
     return {
-        "region": Regions(network, kappa, grid=False),
-        "grid": Regions(network, kappa, grid=True),
+        "region": Regions(network, choice, grid=False),
+        "grid": Regions(network, choice, grid=True),
         "box": Boxes(trained(box, outer_quantiles, x, y)),
     }
 
@@ -188,7 +196,8 @@ def study(name: str, d: int, seed: int, picture: Path | None) -> dict[str, Any]:
             "coverage": float((regions.scores(x, y) <= regions.radius).mean()),
             "mean_area": float(regions.areas(x[:200]).mean()),
         }
-    found["kappa"] = cast("Regions", sets["region"]).kappa
+    choice = cast("Regions", sets["region"]).choice
+    found["kappa"], found["points"] = choice.kappa, len(choice.points)
     found["area_ratio"] = found["box"]["mean_area"] / found["region"]["mean_area"]
     if picture is not None:
         draw(name, d, sets, picture)
@@ -212,7 +221,7 @@ def draw(name: str, d: int, sets: dict[str, Regions | Boxes], path: Path) -> Non
             samples = samples[np.abs(samples[:, 2] - third) < 0.1]
             plane = np.column_stack([plane, np.full(len(plane), third)])
         for kind, colour in (("box", "tab:orange"), ("grid", "tab:green"), ("region", "tab:blue")):
-            scores = sets[kind].scores(np.full((len(plane), 1), at), plane)
+            scores = sets[kind].scores(np.full((1, 1), at), plane)
             inside = (scores <= sets[kind].radius).reshape(len(b), len(a)).astype(float)
             if kind == "region":
                 axis.contourf(a, b, inside, levels=(0.5, 1.5), colors=[colour], alpha=0.25)
@@ -251,7 +260,8 @@ def main() -> None:
                 )
                 print(
                     f"{name} {d}-D seed {seed}: coverage, mean area: {cells}; box / region "
-                    f"{found['area_ratio']:.2f}; kappa {found['kappa']:g}",
+                    f"{found['area_ratio']:.2f}; kappa {found['kappa']:g}, "
+                    f"{found['points']} points",
                     flush=True,
                 )
     if arguments.json:

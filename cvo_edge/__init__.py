@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         UsageError,
     )
     from cvo_edge.odometer import Odometer
-    from cvo_edge.pose import Chart, ConformalSet, Pose, PoseInterval, Reason, Status
+    from cvo_edge.pose import Chart, ConformalSet, Ellipsoids, Pose, PoseInterval, Reason, Status
     from cvo_edge.sources import Frame, open_source
 
 __version__ = "0.1.0"
@@ -38,6 +38,7 @@ __all__ = [
     "Chart",
     "ConformalSet",
     "CvoError",
+    "Ellipsoids",
     "Frame",
     "GateError",
     "ModelError",
@@ -61,6 +62,7 @@ _HOMES = {
     "Chart": "pose",
     "ConformalSet": "pose",
     "CvoError": "errors",
+    "Ellipsoids": "pose",
     "Frame": "sources",
     "GateError": "errors",
     "ModelError": "errors",

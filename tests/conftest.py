@@ -15,6 +15,7 @@ from hypothesis import settings
 from cvo_edge import artifact
 from cvo_edge.artifact import Bundle, Calibration, Threshold
 from cvo_edge.heads import HEADS, Head
+from cvo_edge.pose import Scope
 
 # Shared machines are slow now and then: a law that holds late still holds.
 settings.register_profile("project", deadline=None)
@@ -59,7 +60,7 @@ def rewrite(copied_bundle: Path) -> Callable[[Calibration], Path]:
 
 @pytest.fixture(scope="session")
 def make_head(bundle: Bundle) -> Callable[..., Head]:
-    """Head of a method with these parameters, score and thresholds at 0.9 marginal."""
+    """Head of a method with these parameters, score and thresholds at 0.9."""
 
     def make(
         method: str,
@@ -67,8 +68,9 @@ def make_head(bundle: Bundle) -> Callable[..., Head]:
         parameters: dict[str, Any],
         q_hat: Any = (None,) * 6,
         q_hat_upper: Any = None,
+        scope: Scope = "marginal",
     ) -> Head:
-        entry = Threshold(confidence=0.9, scope="marginal", q_hat=q_hat, q_hat_upper=q_hat_upper)
+        entry = Threshold(confidence=0.9, scope=scope, q_hat=q_hat, q_hat_upper=q_hat_upper)
         source = msgspec.structs.replace(bundle.calibration.calibration, score=score)
         calibration: Calibration = msgspec.structs.replace(
             bundle.calibration,

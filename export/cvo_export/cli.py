@@ -120,6 +120,21 @@ class ResidualsName(StrEnum):
     HELD_OUT = "held_out"
 
 
+class AugmentationName(StrEnum):
+    """What MC-dropout passes add to the training data of a region."""
+
+    NONE = "none"
+    PREDICTIONS = "predictions"
+    LABELS = "labels"
+
+
+class ScaleName(StrEnum):
+    """What decides the unit of a region's codebook."""
+
+    LOCAL = "local"
+    CONSTANT = "constant"
+
+
 class JointName(StrEnum):
     """How six scores become the joint scope."""
 
@@ -260,7 +275,8 @@ def train(
     components: Annotated[
         int | None,
         typer.Option(
-            min=0, help="cqr: principal components the forest sees, 58; mdn: Gaussians, 5."
+            min=0,
+            help="cqr, mcqr: principal components of the features, 58, 16; mdn: Gaussians, 3.",
         ),
     ] = None,
     forest: Annotated[
@@ -284,8 +300,25 @@ def train(
         float | None,
         typer.Option(min=0.01, help="csp: deviation of the labels in classes; val chooses."),
     ] = None,
+    augmentation: Annotated[
+        AugmentationName | None,
+        typer.Option(
+            help="mcqr: MC-dropout passes as training data; none by default; predictions: the "
+            "paper's."
+        ),
+    ] = None,
+    passes: Annotated[
+        int | None, typer.Option(min=1, help="mcqr: stochastic passes of each frame, 20.")
+    ] = None,
+    scale: Annotated[
+        ScaleName | None, typer.Option(help="mcqr: local by default; constant: the paper's.")
+    ] = None,
+    kappa: Annotated[
+        float | None, typer.Option(min=0.01, help="mcqr: inflation of the region; val chooses.")
+    ] = None,
     dropout: Annotated[
-        float | None, typer.Option(min=0, max=0.99, help="mc-dropout: rate, 0.1; cjp, csp: 0.")
+        float | None,
+        typer.Option(min=0, max=0.99, help="mc-dropout: rate, 0.01; mcqr: 0.05; cjp, csp: 0."),
     ] = None,
 ) -> None:
     """Train a method on a data set; interrupted, the same command goes on.
@@ -333,6 +366,10 @@ def train(
             "labels": labels,
             "label_sigma": label_sigma,
             "dropout": dropout,
+            "augmentation": augmentation.value if augmentation else None,
+            "passes": passes,
+            "scale": scale.value if scale else None,
+            "kappa": kappa,
         },
     )
     with show_progress() as progress:
@@ -347,7 +384,7 @@ RuleOption = Annotated[
 JointOption = Annotated[JointName, typer.Option(help="How the joint scope is made.")]
 ScoreOption = Annotated[
     str | None,
-    typer.Option(help="cjp, cqr: normalised, additive; csp: aps, lac, raps; val decides."),
+    typer.Option(help="csp: aps, lac, raps; all others: normalised, additive; val decides."),
 ]
 SidesOption = Annotated[
     SidesName | None,

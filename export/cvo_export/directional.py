@@ -16,12 +16,15 @@ is a region; decoded, it may be a ring, a banana or two pieces. What is ours:
   its likelihood. The autoencoder works on v;
 - the region is not a grid but a codebook of one size: rays from the centre, cut where they leave
   the region, times kappa, at three shells. ``grid`` codebooks, as in the paper, are there to check
-  it: all points of a latent grid that lie inside.
+  it: all points of a latent grid that lie inside;
+- points that are the nearest to hardly any training response are left out: they stand where the
+  ball in latent space covers a gap, such as the middle of a ring.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple, cast
 
@@ -46,6 +49,8 @@ KAPPAS = (0.2, 0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0)
 # A ray nearly parallel to a half-space never leaves it.
 _PARALLEL = 1e-3
 _LEAST_RADIUS = 1e-3
+# A point of the codebook that is the nearest to less than this, of its even share, is left out.
+_LEAST_SHARE = 0.1
 _TAIL = 5.0
 # Responses this many scales out say no more of the shape.
 _FAR = 20.0
@@ -134,6 +139,10 @@ class RegionNetwork(nn.Module):
         z = self.centre(c)[:, None] + radius[:, self.ray, None] * self.shells
         return self._decoded(z, c)
 
+    def keep(self, points: Tensor) -> None:
+        """Leave out all other points of the codebook; indices in ascending order."""
+        self.shells, self.ray = self.shells[points], self.ray[points]
+
     def grid_codebook(self, c: Tensor, side: int = 16) -> tuple[Tensor, Tensor]:
         """All points of a latent grid, decoded, (n, side^3, d), and which are inside, (n, side^3).
 
@@ -184,21 +193,50 @@ class RegionNetwork(nn.Module):
         return points
 
 
-def best_kappa(network: RegionNetwork, c: Tensor, y: Array) -> float:
-    """Return the inflation whose regions are smallest, for val's c (n, c) and y (n, d)."""
-    return min(KAPPAS, key=lambda kappa: mean_volume(network, c, y, kappa))
+class Choice(NamedTuple):
+    """Inflation of a region, and which points of its codebook stay, ascending."""
+
+    kappa: float
+    points: NDArray[np.int64]
+
+
+def best_choice(
+    network: RegionNetwork,
+    train: tuple[Tensor, Array],
+    val: tuple[Tensor, Array],
+    kappas: Sequence[float] = KAPPAS,
+) -> Choice:
+    """Return what makes val's regions smallest; train and val are c (n, c) and y (n, d) each."""
+    everything = np.arange(len(network.shells))
+    choices = [
+        Choice(kappa, points)
+        for kappa in kappas
+        for points in (everything, _used(network, *train, kappa))
+    ]
+    return min(choices, key=lambda choice: mean_volume(network, *val, choice))
+
+
+@torch.no_grad()
+def _used(network: RegionNetwork, c: Tensor, y: Array, kappa: float) -> NDArray[np.int64]:
+    """Points of the codebook that are the nearest to their share of the responses, or a tenth."""
+    v = np.linalg.solve(network.scale(c).double().numpy(), y[:, :, np.newaxis])
+    responses = torch.from_numpy(v[:, :, 0]).float()
+    codebook = network.codebook(c, torch.tensor(kappa))
+    nearest = torch.linalg.norm(codebook - responses[:, None], dim=2).argmin(dim=1)
+    counts = np.bincount(nearest.numpy(), minlength=codebook.shape[1])
+    return np.flatnonzero(counts >= _LEAST_SHARE * len(y) / codebook.shape[1])
 
 
 @torch.no_grad()
 def mean_volume(
-    network: RegionNetwork, c: Tensor, y: Array, kappa: float, draws: int = 400
+    network: RegionNetwork, c: Tensor, y: Array, choice: Choice, draws: int = 400
 ) -> float:
     """Geometric mean volume of the regions at 90 %, to the power 1/d.
 
     Condition (n, c), responses (n, d), on which the radius is taken, too.
     """
-    codebook = network.codebook(c, torch.tensor(kappa)).double().numpy()
-    scale = network.scale(c).double().numpy()
+    codebook = network.codebook(c, torch.tensor(choice.kappa)).double().numpy()
+    codebook, scale = codebook[:, choice.points], network.scale(c).double().numpy()
     radius = conformal_quantile(scaled_distances(codebook, scale, y), 0.9)
     volumes = [union_log_volume(points, radius, draws) for points in codebook]
     determinants = np.log(np.diagonal(scale, axis1=1, axis2=2)).sum(axis=1)
@@ -206,7 +244,10 @@ def mean_volume(
 
 
 def scaled_distances(codebook: Array, scale: Array, y: Array) -> Array:
-    """Codebook (n, J, d) before B, B (n, d, d), y (n, d) -> distance to the nearest point, (n,)."""
+    """Codebook (n, J, d) before B, B (n, d, d), y (n, d) -> distance to the nearest point, (n,).
+
+    Or one codebook and one B for all y.
+    """
     v = np.linalg.solve(scale, y[:, :, np.newaxis])[:, np.newaxis, :, 0]
     return np.asarray(np.linalg.norm(codebook - v, axis=2).min(axis=1))
 

@@ -223,6 +223,12 @@ def _level_lines(rule: str, levels: list[dict[str, Any]]) -> list[str]:
         for level in levels
         if level["confidence"] == 0.9 and "set_size" in level
     ]
+    lines += [
+        f"{level['confidence']:<8g}{level['scope']:<12}volume over that of the poses' deviations, "
+        f"to the power 1/6: {level['joint_volume']['geometric_mean'] ** (1 / 6):.3f}"
+        for level in levels
+        if level["confidence"] == 0.9 and "joint_volume" in level
+    ]
     if not all(level["coverage_band_exact"] for level in levels):
         lines.append("? indicative: frames of one recording are no independent draws")
     return lines

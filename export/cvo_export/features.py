@@ -6,9 +6,12 @@ times faster than torch on a CPU, and exactly what the device will compute.
 
 from __future__ import annotations
 
+import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from threading import Lock
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -61,16 +64,38 @@ class ModelImages:
 
 
 class FeatureExtractor:
-    """Images (height, width, 3) uint8 RGB -> features (size,), by the exported backbone."""
+    """Images (height, width, 3) uint8 RGB -> features (size,), by the exported backbone.
+
+    Exported when the first image comes: where all features are at hand, none does.
+    """
 
     def __init__(self, backbone: Backbone, height: int, width: int) -> None:
-        blank = torch.zeros((1, height, width, 3), dtype=torch.uint8)
-        # One thread each: several images at a time need no waiting for one another.
-        self._session = Session(export_onnx(backbone, [blank], ["image"], ["features"]), threads=1)
+        self._backbone = backbone
+        self._blank = torch.zeros((1, height, width, 3), dtype=torch.uint8)
+        self._session: Session | None = None
+        self._exporting = Lock()
 
     def __call__(self, image: Image) -> NDArray[np.float32]:
         """Return the features of one image."""
+        with self._exporting:
+            if self._session is None:
+                content = export_onnx(self._backbone, [self._blank], ["image"], ["features"])
+                # One thread each: several images at a time need no waiting for one another.
+                self._session = Session(content, threads=1)
         return np.asarray(self._session.run({"image": image[np.newaxis]})["features"][0])
+
+
+def cached_features(
+    folder: Path, images: ModelImages, extractor: FeatureExtractor
+) -> NDArray[np.float32]:
+    """Features (n, size) of images as they are, kept in a file named for their pixels."""
+    digest = hashlib.sha256(images.images.tobytes()).hexdigest()[:24]
+    path = folder / f"frames-{digest}.npz"
+    found = _stored(path, len(images))
+    if found is None:
+        found = {"features": np.stack([extractor(image) for image in images.images])}
+        _store(path, found)
+    return found["features"]
 
 
 def cached_copies(
@@ -89,33 +114,33 @@ def cached_copies(
     features, poses = [], []
     for number in range(copies + 1):
         path = folder / f"copy-{number:03d}.npz"
-        found = _stored_copy(path, len(images))
+        found = _stored(path, len(images))
         if found is None:
             graded = config.graded(number / max(1, copies))
             found = _one_copy(images, extractor, graded, (seed, number))
-            _store_copy(path, found)
-        features.append(found[0])
-        poses.append(found[1])
+            _store(path, found)
+        features.append(found["features"])
+        poses.append(found["poses"])
         progress("features", number + 1, copies + 1)
     return np.stack(features), np.stack(poses)
 
 
-def _stored_copy(path: Path, count: int) -> tuple[NDArray[np.float16], Array] | None:
-    """Features and poses of a copy, or None where there are none, or no whole ones."""
+def _stored(path: Path, count: int) -> dict[str, NDArray[Any]] | None:
+    """Arrays of ``count`` rows each, or None where there are none, or no whole ones."""
     try:
         with np.load(path) as stored:
-            features, poses = stored["features"], stored["poses"]
+            arrays = dict(stored)
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
-    return (features, poses) if len(features) == len(poses) == count else None
+    return arrays if {len(array) for array in arrays.values()} == {count} else None
 
 
-def _store_copy(path: Path, copy: tuple[NDArray[np.float16], Array]) -> None:
-    """Write a copy under a name of its own first: another run may be writing the same one."""
+def _store(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """Write under a name of its own first: another run may be writing the same file."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with NamedTemporaryFile(dir=path.parent, suffix=".partial", delete=False) as stream:
-            np.savez(stream, features=copy[0], poses=copy[1])
+            np.savez(stream, allow_pickle=False, **arrays)
         Path(stream.name).replace(path)
     except OSError as error:
         raise SinkError(f"{path}: cannot be written: {error.strerror}") from None
@@ -123,7 +148,7 @@ def _store_copy(path: Path, copy: tuple[NDArray[np.float16], Array]) -> None:
 
 def _one_copy(
     images: ModelImages, extractor: FeatureExtractor, config: AugmentConfig, seed: tuple[int, int]
-) -> tuple[NDArray[np.float16], Array]:
+) -> dict[str, NDArray[Any]]:
     def one(row: int) -> tuple[NDArray[np.float16], Array]:
         # A generator of its own for each image: the result does not depend on the order.
         image, pose = images.augmented(row, config, np.random.default_rng((*seed, row)))
@@ -132,4 +157,7 @@ def _one_copy(
     # OpenCV and onnxruntime let other threads run, so whole images are the unit of work.
     with ThreadPoolExecutor(max_workers=allowed_cores()) as pool:
         found = list(pool.map(one, range(len(images))))
-    return np.stack([features for features, _ in found]), np.stack([pose for _, pose in found])
+    return {
+        "features": np.stack([features for features, _ in found]),
+        "poses": np.stack([pose for _, pose in found]),
+    }

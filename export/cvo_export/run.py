@@ -134,11 +134,16 @@ class Run:
     def best(self) -> History:
         """The evaluation of the weights that were kept, of all networks that val chose among.
 
-        Networks of other folds are no candidates.
+        Networks of other folds are no candidates, nor are models of residuals.
         """
         last_phase = max(entry.phase for entry in self.history)
         return min(
-            (e for e in self.history if e.phase == last_phase and "-fold" not in e.lesson),
+            (
+                entry
+                for entry in self.history
+                if entry.phase == last_phase
+                and not any(part in entry.lesson for part in ("-fold", "-region"))
+            ),
             key=lambda entry: entry.val_score,
         )
 

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, cast
 
 import msgspec
@@ -28,7 +29,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from cvo_edge.errors import UsageError
 from cvo_export.backbone import Backbone, load_weights
 from cvo_export.datasets import PoseDataset, open_dataset
-from cvo_export.features import FeatureExtractor, ModelImages, cached_copies
+from cvo_export.features import FeatureExtractor, ModelImages, cached_copies, cached_features
 from cvo_export.heads import Setting
 from cvo_export.heads.base import Examples, L, Learner
 from cvo_export.methods import TRAINABLE
@@ -99,15 +100,20 @@ def prepare_features(config: TrainConfig, cache: Path, progress: Progress) -> No
     Features of random weights are a run's own: then nothing is done.
     """
     dataset = open_dataset(config.dataset)
-    indices = _training_frames(make_split(dataset, config.split, config.seed))
+    split = make_split(dataset, config.split, config.seed)
+    indices = _training_frames(split)
     backbone = Backbone(config.backbone, config.height, config.width)
     weights_sha256 = load_weights(backbone, config.weights)
     if weights_sha256 is None:
         return
+    folder = _shared_folder(cache, config, weights_sha256, dataset, indices)
+    size = (config.height, config.width, config.crop)
+    extractor = FeatureExtractor(backbone, config.height, config.width)
+    cached_features(folder, ModelImages(dataset, split.roles["val"], *size), extractor)
     cached_copies(
-        _shared_folder(cache, config, weights_sha256, dataset, indices),
-        ModelImages(dataset, indices, config.height, config.width, config.crop),
-        FeatureExtractor(backbone, config.height, config.width),
+        folder,
+        ModelImages(dataset, indices, *size),
+        extractor,
         config.augment,
         config.copies,
         config.seed,
@@ -138,12 +144,14 @@ class _Material:
         Shapes (copies + 1, n, size), (copies + 1, n, 7) and (n_val, size).
         """
         if phase not in self._cached:
-            config = self.config
-            extractor = FeatureExtractor(self.backbone, config.height, config.width)
-            val = np.stack([extractor(image) for image in self.val_images.images])
-            features, poses = cached_copies(
+            config, folder = self.config, self.features_folder
+            if phase > 0:
                 # A backbone that has learnt is this run's alone.
-                self.run_dir / f"{FEATURES_FOLDER}-{phase}" if phase else self.features_folder,
+                folder = self.run_dir / f"{FEATURES_FOLDER}-{phase}"
+            extractor = FeatureExtractor(self.backbone, config.height, config.width)
+            val = cached_features(folder, self.val_images, extractor)
+            features, poses = cached_copies(
+                folder,
                 self.images,
                 extractor,
                 config.augment,
@@ -163,7 +171,7 @@ class _Material:
 class _Trainer:
     """The lessons of a run; see ``cvo_export.heads.base.Lessons``.
 
-    A run that fine-tunes its backbone has one lesson: another would learn from other features.
+    A run that fine-tunes its backbone has one lesson on features: another would learn from others.
     """
 
     def __init__(
@@ -185,7 +193,7 @@ class _Trainer:
         examples: Examples | None = None,
     ) -> L:
         """Train what ``build`` makes, with random numbers of its own name."""
-        if self.fine_tuned and self.history:
+        if self.fine_tuned and self.history and examples is None:
             raise UsageError(f"fine-tune: expected a method of one lesson, found another, {name}")
         torch.manual_seed(_lesson_seed(self.setting.seed, name))
         learner = build()
@@ -239,7 +247,8 @@ class _Lesson:
         """Run all phases, from the checkpoint if there is one; returns the history."""
         checkpoint = self._read_checkpoint()
         first = checkpoint["phase"] if checkpoint else 0
-        for phase in range(first, 3 if self.config.fine_tune else 1):
+        phases = 3 if self.config.fine_tune and self._examples is None else 1
+        for phase in range(first, phases):
             state = checkpoint if checkpoint and phase == first else None
             if phase == 1:
                 self._fit_all(phase, state)
@@ -394,8 +403,17 @@ class _Lesson:
     def _read_checkpoint(self) -> dict[str, Any] | None:
         if not self._path.is_file():
             return None
-        state: dict[str, Any] = torch.load(self._path, weights_only=True)
-        self.both.load_state_dict(state["weights"])
+        try:
+            state: dict[str, Any] = torch.load(self._path, weights_only=True)
+            self.both.load_state_dict(state["weights"])
+            self._learning(state["phase"]).load_state_dict(state["best"]["weights"])
+            self.both.load_state_dict(state["weights"])
+        # What torch raises for another network's file, or one that is none.
+        except (RuntimeError, KeyError, UnpicklingError, EOFError):
+            raise UsageError(
+                f"{self._path}: expected a checkpoint of this version, found another file; remove "
+                "it to train anew"
+            ) from None
         self.history = [History(*entry) for entry in state["history"]]
         return state
 

@@ -42,6 +42,7 @@ def union_log_volume(centres: Array, radius: float, draws: int = _DRAWS) -> floa
 
 def ellipsoids_volume(region: Ellipsoids) -> float:
     """Volume of a union of ellipsoids, in the units of its chart: m^3 rad^3."""
-    centres = np.linalg.solve(region.scale, region.centres.astype(np.float64).T).T
+    solved = np.linalg.solve(region.scale, region.centres.astype(np.float64).T)
+    centres = np.asarray(solved.T, np.float64)
     log_determinant = float(np.log(np.abs(np.diag(region.scale))).sum())
     return math.exp(union_log_volume(centres, region.radius) + log_determinant)

@@ -11,7 +11,7 @@ from cvo_edge.selftest import check_selftest
 from cvo_edge.trajectory import open_ground_truth
 
 ARTIFACTS = Path(__file__).resolve().parents[2] / "calibration_artifacts"
-METHODS = ["cjp", "cqr", "csp"]
+METHODS = ["cjp", "cqr", "csp", "mcqr"]
 
 
 @pytest.fixture(params=METHODS)

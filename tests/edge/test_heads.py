@@ -7,14 +7,15 @@ from cvo_edge.artifact import Threshold
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads.cqr import IntervalScore
 from cvo_edge.heads.csp import Score, class_scores
+from cvo_edge.pose import scaled_distance
 
 FLOOR = [0.01] * 6
 GRID = np.linspace(-3.0, 3.0, 241)
 
 
-def threshold(q_hat, q_hat_upper=None):
+def threshold(q_hat, q_hat_upper=None, scope="marginal"):
     upper = None if q_hat_upper is None else tuple(q_hat_upper)
-    return Threshold(confidence=0.9, scope="marginal", q_hat=tuple(q_hat), q_hat_upper=upper)
+    return Threshold(confidence=0.9, scope=scope, q_hat=tuple(q_hat), q_hat_upper=upper)
 
 
 # -- intervals ----------------------------------------------------------------------------------
@@ -255,3 +256,126 @@ def test_a_score_or_a_side_of_another_method_is_refused(make_head):
         make_head("csp", "additive", parameters())
     with pytest.raises(CalibrationFileError, match="q_hat_upper"):
         make_head("csp", "aps", parameters(), q_hat_upper=(0.5,) * 6)
+
+
+# -- regions ------------------------------------------------------------------------------------
+
+POINTS = {"points": 20, "half_width_floor": FLOOR}
+
+
+def codebooks(seed, count=1):
+    """Outputs of ``count`` frames: 20 points, and a scale that leans."""
+    generator = np.random.default_rng(seed)
+    scale = np.tril(generator.normal(0.0, 0.1, (count, 6, 6)))
+    scale[:, range(6), range(6)] = generator.uniform(0.1, 0.3, (count, 6))
+    codebook = generator.normal(0.0, 0.5, (count, 20, 6))
+    return {"codebook": codebook.astype(np.float32), "scale": scale.astype(np.float32)}
+
+
+def near(outputs, seed, count=400):
+    """Points about the codebook of one frame, inside and outside of its region."""
+    generator = np.random.default_rng(seed)
+    centres = outputs["codebook"][0, generator.integers(20, size=count)]
+    steps = generator.standard_normal((count, 6)) * generator.uniform(0.0, 1.2, (count, 1))
+    return centres + steps @ outputs["scale"][0].T
+
+
+def test_the_distance_is_that_of_an_independent_solver():
+    outputs = codebooks(0, 5)
+    y = np.random.default_rng(1).normal(0.0, 1.0, (5, 6))
+    found = scaled_distance(outputs["codebook"], outputs["scale"], y)
+    for row in range(5):
+        scale = outputs["scale"][row].astype(np.float64)
+        difference = y[row] - outputs["codebook"][row].astype(np.float64)
+        expected = np.linalg.norm(np.linalg.solve(scale, difference.T), axis=0).min()
+        assert found[row] == pytest.approx(expected)
+
+
+def test_what_has_no_extent_holds_nothing(make_head):
+    outputs = codebooks(0)
+    outputs["scale"][0, 2, 2] = 0.0
+    head = make_head("mcqr", "additive", POINTS)
+    region = head.region(outputs, np.zeros(6), threshold([1e9] * 6, scope="joint"))
+    assert not region.contains(outputs["codebook"][0, 0])
+    scores = head.scores(outputs, np.zeros((1, 6)), outputs["codebook"][:, 0], "joint")
+    assert np.isinf(scores).all()
+
+
+@pytest.mark.parametrize("radius", [0.0, 1.0, 2.5, None])
+def test_the_joint_region_is_exactly_where_the_distance_is_at_most_r(make_head, radius):
+    head = make_head("mcqr", "normalised", POINTS)
+    outputs = codebooks(2)
+    region = head.region(outputs, np.zeros(6), threshold([radius] * 6, scope="joint"))
+    limit = np.inf if radius is None else radius
+    inside = 0
+    for y in near(outputs, 3):
+        scores = head.scores(outputs, np.zeros((1, 6)), y[None], "joint")
+        assert scores.shape == (1, 1, 6)
+        assert (scores == scores[0, 0, 0]).all()
+        assert region.contains(y) == (scores[0, 0, 0] <= limit)
+        # The hull holds all that the region holds.
+        assert region.covers(y).all() or not region.contains(y)
+        inside += region.contains(y)
+    assert (inside == 0) is (radius == 0.0)
+
+
+def test_the_hull_touches_the_region_on_all_twelve_sides(make_head):
+    head = make_head("mcqr", "normalised", POINTS)
+    outputs = codebooks(4)
+    region = head.region(outputs, np.zeros(6), threshold([1.5] * 6, scope="joint"))
+    codebook, scale = outputs["codebook"][0].astype(float), outputs["scale"][0].astype(float)
+    for dof in range(6):
+        # The ellipsoid's own point that lies furthest along this axis.
+        furthest = 1.5 * scale @ scale[dof] / np.linalg.norm(scale[dof])
+        top = codebook[codebook[:, dof].argmax()] + furthest
+        bottom = codebook[codebook[:, dof].argmin()] - furthest
+        assert top[dof] == pytest.approx(region.upper[dof])
+        assert bottom[dof] == pytest.approx(region.lower[dof])
+        assert region.ellipsoids.distance(top) == pytest.approx(1.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("score", ["additive", "normalised"])
+@pytest.mark.parametrize("q_hat", [0.0, 0.3, 1.7])
+def test_six_intervals_on_the_raw_hull_are_where_the_marginal_score_is_at_most_q(
+    make_head, score, q_hat
+):
+    head = make_head("mcqr", score, POINTS)
+    outputs = codebooks(5)
+    region = head.region(outputs, np.zeros(6), threshold([q_hat] * 6))
+    assert region.ellipsoids is None
+    for y in GRID:
+        scores = head.scores(outputs, np.zeros((1, 6)), np.full((1, 6), y))[0, 0]
+        close = np.isclose(scores, q_hat, atol=1e-9)
+        inside = region.covers(np.full(6, y))
+        np.testing.assert_array_equal(inside | close, (scores <= q_hat) | close)
+
+
+def test_region_scores_of_stacked_frames_are_those_of_each_to_the_last_bit(make_head):
+    head = make_head("mcqr", "normalised", POINTS)
+    outputs = codebooks(6, 20)
+    y = np.random.default_rng(7).normal(0.0, 1.0, (20, 6))
+    for scope in ("marginal", "joint"):
+        stacked = head.scores(outputs, y, y, scope)
+        for row in range(20):
+            one = {name: values[row : row + 1] for name, values in outputs.items()}
+            found = head.scores(one, y[:1], y[row : row + 1], scope)
+            np.testing.assert_array_equal(found[0], stacked[row])
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"score": "residual"}, "normalised, additive"),
+        ({"parameters": {**POINTS, "points": 0}}, "points"),
+        ({"parameters": {**POINTS, "half_width_floor": [0.0] * 6}}, "half_width_floor"),
+        ({"parameters": {"points": 20}}, "half_width_floor"),
+        ({"q_hat_upper": (0.5,) * 6}, "q_hat_upper"),
+        ({"q_hat": (1.0,) * 5 + (1.1,), "scope": "joint"}, "six times"),
+        ({"q_hat": (1.0,) * 5 + (None,), "scope": "joint"}, "six times"),
+        ({"q_hat": (-1.0,) * 6, "scope": "joint"}, "at least 0"),
+    ],
+)
+def test_parameters_and_thresholds_that_are_no_region_are_refused(make_head, changes, match):
+    given = {"score": "normalised", "parameters": POINTS, **changes}
+    with pytest.raises(CalibrationFileError, match=match):
+        make_head("mcqr", **given)

@@ -1,4 +1,4 @@
-"""CQR and CSP from training to bundle: what holds for every method, and what for each."""
+"""CQR, CSP and MCQR from training to bundle: what holds for every method, and what for each."""
 
 import csv
 import io
@@ -20,6 +20,8 @@ from cvo_export.configure import configure
 from cvo_export.evaluate import evaluate, find_level, table
 from cvo_export.heads.cqr import CqrConfig
 from cvo_export.heads.csp import Classes, CspConfig, CspLearner, best_temperatures, set_score
+from cvo_export.heads.mcqr import McqrConfig
+from cvo_export.heads.point import PointNetwork
 from cvo_export.plot import plot
 from cvo_export.publish import publish
 from cvo_export.run import load_run
@@ -31,6 +33,7 @@ from .test_train import InterruptedTrainingError, same_weights, stopping_after
 CONFIGS = {
     "cqr": CqrConfig(trees=20, components=8, forest_copies=1),
     "csp": CspConfig(classes=12, label_sigma=1.5),
+    "mcqr": McqrConfig(components=8, rays=24, augmentation="predictions", passes=3),
 }
 
 
@@ -71,8 +74,8 @@ def test_a_finished_run_is_read_back_and_publishes_the_same_bundle(runs, method,
 
 def test_an_interrupted_run_ends_as_if_it_never_was(runs, method, tmp_path):
     _, run, _ = runs(method)
-    # For CQR in the second of its four lessons.
-    calls = {"cqr": 50, "csp": 25}[method]
+    # For CQR in the second of its four lessons, for MCQR in the last of its five.
+    calls = {"cqr": 50, "csp": 25, "mcqr": 170}[method]
     with pytest.raises(InterruptedTrainingError):
         train(tmp_path / "run", tiny_config(head=CONFIGS[method]), stopping_after(calls, method))
     resumed = train(tmp_path / "run", tiny_config(head=CONFIGS[method]), ignore_progress)
@@ -126,7 +129,7 @@ def test_backbones_that_learn_train_too(tmp_path, method):
 
 def test_a_score_that_the_method_does_not_have_is_refused_with_those_it_has(runs, method, tmp_path):
     _, run, _ = runs(method)
-    known = {"cqr": "normalised, additive", "csp": "aps, lac, raps"}[method]
+    known = {"csp": "aps, lac, raps"}.get(method, "normalised, additive")
     with pytest.raises(UsageError, match=known):
         publish(run, tmp_path / "bundle", "other", score="other")
     assert not (tmp_path / "bundle").exists()
@@ -134,6 +137,10 @@ def test_a_score_that_the_method_does_not_have_is_refused_with_those_it_has(runs
 
 def test_bonferroni_is_recorded_and_is_the_marginal_rule_at_a_sixth(runs, method, tmp_path):
     _, run, _ = runs(method)
+    if method == "mcqr":
+        with pytest.raises(UsageError, match="one score for all six"):
+            publish(run, tmp_path / "bundle", "b", joint="bonferroni")
+        return
     calibration = publish(run, tmp_path / "bundle", "b", joint="bonferroni")
     assert calibration.calibration.joint == "bonferroni"
     # 64 frames: 1 - 0.1/6 needs rank 64.
@@ -279,6 +286,129 @@ def test_offsets_about_a_prediction_still_have_an_implausible_rotation(runs):
     assert pose.rotation == "tangent_predicted"
     assert pose.reference_q_xyzw is not None
     assert max(pose.limits.highest[3:]) < np.pi
+
+
+# -- MCQR ---------------------------------------------------------------------------------------
+
+
+def test_the_graph_is_the_definition_step_by_step(runs):
+    _, run, bundle = runs("mcqr")
+    head, image = run.graph.head, run.dataset.read_image(int(run.split.roles["test"][0]))
+    with Odometer.load(bundle) as odometer:
+        seen = odometer.observe(image, 0)
+    rgb = torch.from_numpy(image[np.newaxis, :, :, ::-1].copy())
+    with torch.no_grad():
+        features = run.graph.backbone(rgb)
+        point = head.point(features)
+        c = head.standardise(
+            torch.cat([head.point.standardise(features) @ head.components, point], dim=1)
+        )
+        v = head.region.codebook(c, head.kappa)[0].double().numpy()
+        local = head.region.scale(c)[0].double().numpy()
+    unit = head.unit.double().numpy()
+    origin = np.append(seen.pose[:3], [0.0, 0.0, 0.0])
+    expected = origin + (v @ local.T) * unit
+    np.testing.assert_allclose(seen.outputs["codebook"][0], expected, atol=1e-4)
+    np.testing.assert_allclose(seen.outputs["scale"][0], unit[:, None] * local, atol=1e-4)
+
+
+def test_contains_is_the_region_in_the_joint_scope_and_six_intervals_in_the_marginal_one(runs):
+    _, run, bundle = runs("mcqr")
+    indices = run.split.roles["test"].tolist()
+    inside = {}
+    for scope in ("marginal", "joint"):
+        with Odometer.load(bundle, scope=scope, confidence=0.8) as odometer:
+            for index in indices:
+                estimate = odometer.step(run.dataset.read_image(index))
+                truth = run.dataset.poses[index]
+                held = estimate.contains(truth)
+                inside.setdefault(scope, []).append(held)
+                if scope == "marginal":
+                    assert estimate.region.ellipsoids is None
+                    assert held == estimate.covers(truth).all()
+                else:
+                    coordinates = estimate.chart.coordinates(truth, estimate.pose.to_array())
+                    assert held == estimate.region.ellipsoids.contains(coordinates)
+                    # The hull is larger than its region.
+                    corner = 0.999 * estimate.upper + 0.001 * estimate.lower
+                    assert estimate.region.covers(corner).all()
+                    assert not estimate.region.contains(corner)
+    report = evaluate(bundle, run.dataset, "test")
+    for scope, held in inside.items():
+        level = find_level(report["levels"], 0.8, scope)
+        assert level["joint_coverage"] == pytest.approx(np.mean(held))
+
+
+def test_the_volume_is_that_of_the_region_and_less_than_its_hull(runs):
+    _, run, bundle = runs("mcqr")
+    report = evaluate(bundle, run.dataset, "test")
+    level = find_level(report["levels"], 0.9, "joint")
+    deviation = np.array(read_calibration(bundle).pose.standard_deviation)
+    hull = np.prod(np.array(level["mean_width"]) / deviation)
+    assert 0.0 < level["joint_volume"]["mean"] < hull
+
+
+def test_records_have_the_region_on_request_only(runs, tmp_path):
+    _, run, bundle = runs("mcqr")
+    image = run.dataset.read_image(0)
+    with Odometer.load(bundle, scope="joint", confidence=0.8) as odometer:
+        assert odometer.has_region
+        estimate = odometer.step(image)
+    assert "region" not in estimate.to_dict()["interval"]
+    with Sink(str(tmp_path / "out.jsonl"), "jsonl", region=True) as sink:
+        sink.write(estimate)
+    region = json.loads((tmp_path / "out.jsonl").read_text())["interval"]["region"]
+    centres, scale = np.array(region["centres"]), np.array(region["scale"])
+    reach = region["radius"] * np.linalg.norm(scale, axis=1)
+    np.testing.assert_allclose(centres.max(axis=0) + reach, estimate.upper)
+    np.testing.assert_allclose(centres.min(axis=0) - reach, estimate.lower)
+    with pytest.raises(UsageError, match="expected the format jsonl"):
+        Sink(str(tmp_path / "out.csv"), "csv", region=True)
+    with Odometer.load(bundle) as odometer:
+        assert not odometer.has_region
+
+
+def test_passes_are_extra_training_data_and_never_count_as_frames(runs):
+    _, run, bundle = runs("mcqr")
+    calibration = read_calibration(bundle)
+    assert calibration.calibration.n == run.split.roles["cal"].size
+    assert run.graph.head.point.dropout == CONFIGS["mcqr"].dropout
+
+
+def test_the_mean_of_many_passes_is_the_network_itself():
+    # Dropout before a linear layer: its expectation is the deterministic answer.
+    torch.manual_seed(0)
+    network = PointNetwork(30, (16, 12), 0.1, dropout=0.3).eval()
+    features = torch.randn(5, 30)
+    with torch.no_grad():
+        drawn = network.passes(features, 4000, torch.Generator().manual_seed(1))
+        assert drawn.shape == (4000, 5, 6)
+        error = drawn.std(dim=0) / np.sqrt(4000)
+        assert ((drawn.mean(dim=0) - network(features)).abs() < 5 * error + 1e-6).all()
+        assert (drawn.std(dim=0) > 0).all()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"augmentation": "labels", "passes": 2},
+        {"scale": "constant", "residuals": "held_out"},
+        {"kappa": 1.3, "components": 0},
+    ],
+)
+def test_other_regions_train_and_publish(tmp_path, changes):
+    head = McqrConfig(**{"components": 4, "rays": 12, **changes})
+    config = tiny_config(head=head, steps=100, copies=1)
+    run = train(tmp_path / "run", config, ignore_progress)
+    calibration = publish(load_run(tmp_path / "run"), tmp_path / "bundle", "region")
+    assert calibration.pose.rotation == "tangent_predicted"
+    assert 1 <= calibration.method_parameters["points"] <= 1 + 3 * 12
+    held_out = changes.get("residuals") == "held_out"
+    folds = set() if held_out else {"mcqr-fold0", "mcqr-fold1", "mcqr-fold2"}
+    assert {entry.lesson for entry in run.history} == {"mcqr", "mcqr-region", *folds}
+    assert run.best.lesson == "mcqr"
+    if "kappa" in changes:
+        assert float(run.graph.head.kappa) == pytest.approx(1.3)
 
 
 # -- CSP ----------------------------------------------------------------------------------------

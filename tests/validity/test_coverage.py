@@ -71,6 +71,7 @@ CONFIDENCE = 0.9
 FLOOR = [0.01] * 6
 CQR = {"half_width_floor": FLOOR, "sides": "symmetric"}
 CLASSES = {"edges": [np.linspace(-4.0, 4.0, 13).tolist()] * 6, "penalty": 0.05, "free_ranks": 3}
+REGION = {"points": 8, "half_width_floor": FLOOR}
 METHODS = [
     ("cqr", "additive", CQR),
     ("cqr", "normalised", CQR),
@@ -78,7 +79,12 @@ METHODS = [
     ("csp", "lac", CLASSES),
     ("csp", "aps", CLASSES),
     ("csp", "raps", CLASSES),
+    ("mcqr", "additive", REGION),
+    ("mcqr", "normalised", REGION),
 ]
+
+
+SCATTER = np.random.default_rng(0).standard_normal((8, 6))
 
 
 def frames(count, seed):
@@ -92,7 +98,12 @@ def frames(count, seed):
     logits = -0.5 * ((middle - point[..., None]) / (1.3 * spread[..., None])) ** 2
     # Noise, so that ranks differ from distances and no two scores are the same.
     p = np.exp(logits + 0.7 * generator.standard_normal(logits.shape))
+    scale = np.zeros((count, 6, 6), np.float32)
+    scale[:, range(6), range(6)] = spread * generator.uniform(0.5, 1.5, (count, 6))
+    scale[:, 3, 0] = 0.2 * spread[:, 0]
     outputs = {
+        "codebook": (point[:, None] + spread[:, None] * SCATTER).astype(np.float32),
+        "scale": scale,
         "lower": (point - 1.2 * spread).astype(np.float32),
         "upper": (point + 1.2 * spread).astype(np.float32),
         "probabilities": (p / p.sum(axis=-1, keepdims=True)).astype(np.float32),
@@ -123,20 +134,21 @@ def test_scores_are_at_most_the_threshold_in_rank_over_n_plus_one(
     assert abs(np.mean(covered) - expected) < 4.5 * standard_error(expected, n)
 
 
-def as_scored(scores):
-    return Scored(scores, scores, np.zeros(len(scores), np.int64))
+def scored(head, outputs, point, truth):
+    scores = (head.scores(outputs, point, truth, scope) for scope in ("marginal", "joint"))
+    return Scored(*scores, np.zeros(len(truth), np.int64))
 
 
 def coverages(head, n, joint="max"):
     """Per DoF and jointly: (marginal sets, their hulls, joint sets), means over all repeats."""
     outputs, point, truth = frames(REPEATS * (n + TRIALS) + 200, n)
-    scores = head.scores(outputs, point, truth)
-    val, scores = scores[-200:], scores[:-200]
+    every = scored(head, outputs, point, truth)
+    val = Scored(*(values[-200:] for values in every))
     marginal, hulls, jointly = [], [], []
     for repeat in range(REPEATS):
         start = repeat * (n + TRIALS)
-        cal = scores[start : start + n]
-        entries = thresholds(head, as_scored(cal), as_scored(val), "pooled", joint)
+        cal = Scored(*(values[start : start + n] for values in every))
+        entries = thresholds(head, cal, val, "pooled", joint)
         by_scope = {e.scope: e for e in entries if e.confidence == CONFIDENCE}
         for row in range(start + n, start + n + JUDGED):
             one = {name: values[row : row + 1] for name, values in outputs.items()}
@@ -144,7 +156,7 @@ def coverages(head, n, joint="max"):
             y = truth[row]
             marginal.append(inner.covers(y).mean())
             hulls.append(((inner.lower <= y) & (y <= inner.upper)).mean())
-            jointly.append(outer.covers(y).all())
+            jointly.append(outer.contains(y))
     return np.mean(marginal), np.mean(hulls), np.mean(jointly)
 
 

@@ -38,7 +38,7 @@ class McDropoutConfig(
         Share of each hidden layer's outputs that a mask puts to zero.
     """
 
-    dropout: Annotated[float, Meta(gt=0, lt=1)] = 0.1
+    dropout: Annotated[float, Meta(gt=0, lt=1)] = 0.01
 
 
 class McDropoutNetwork(IntervalNetwork):

@@ -33,7 +33,7 @@ class MdnConfig(
         Gaussians in each degree of freedom's mixture.
     """
 
-    components: Annotated[int, Meta(ge=1, le=64)] = 5
+    components: Annotated[int, Meta(ge=1, le=64)] = 3
 
 
 class MdnNetwork(IntervalNetwork):

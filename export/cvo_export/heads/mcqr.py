@@ -22,10 +22,16 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvo_edge.errors import UsageError
 from cvo_edge.heads.mcqr import McqrParameters
 from cvo_export.calibrate import Candidate
-from cvo_export.directional import RegionConfig, RegionNetwork, best_kappa, mean_volume
+from cvo_export.directional import (
+    KAPPAS,
+    Choice,
+    RegionConfig,
+    RegionNetwork,
+    best_choice,
+    mean_volume,
+)
 from cvo_export.heads.base import (
     DOF,
     Examples,
@@ -52,6 +58,8 @@ Array = NDArray[np.float64]
 # What early stopping looks at: one inflation, and few draws for the volume.
 _USUAL_KAPPA = 0.8
 _FEW_DRAWS = 100
+# Training rows that show which points of the codebook are of use.
+_USAGE_ROWS = 4000
 _LEAST_SCALE = 1e-6
 
 
@@ -135,7 +143,8 @@ class RegionLearner(Learner):
 
         Condition (n, components + 6) and scaled residuals (n, 6).
         """
-        return mean_volume(self.network, self.standardise(features), y, _USUAL_KAPPA, _FEW_DRAWS)
+        usual = Choice(_USUAL_KAPPA, np.arange(len(self.network.shells)))
+        return mean_volume(self.network, self.standardise(features), y, usual, _FEW_DRAWS)
 
 
 class McqrHead(ExportedHead):
@@ -155,6 +164,7 @@ class McqrHead(ExportedHead):
         learner: RegionLearner,
         unit: Tensor,
         kappa: Tensor,
+        points: Tensor,
         setting: Setting,
     ) -> None:
         super().__init__()
@@ -162,7 +172,12 @@ class McqrHead(ExportedHead):
         self.decoder = PoseDecoder(setting.target)
         self.standardise = learner.standardise
         self.region = learner.network
-        for name, values in (("components", components), ("unit", unit), ("kappa", kappa)):
+        for name, values in (
+            ("components", components),
+            ("unit", unit),
+            ("kappa", kappa),
+            ("points", points),
+        ):
             self.register_buffer(name, values)
         # Of the predicted position alone: a prediction's own rotation numbers are zero.
         self.register_buffer("origin", torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
@@ -194,8 +209,6 @@ class McqrHead(ExportedHead):
 
 
 def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
-    if lessons.fine_tuned:
-        raise UsageError("fine-tune: expected none for mcqr, whose region has a lesson of its own")
     setting, passes = lessons.setting, config.augmentation != "none"
     held_out = learn_held_out(
         lessons,
@@ -233,17 +246,45 @@ def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
         val_residual / unit,
     )
     learner = lessons.learn("mcqr-region", lambda: RegionLearner(config), examples=examples)
+    choice = _choice(learner, examples, config, setting.seed)
+    points = torch.from_numpy(choice.points)
+    learner.network.keep(points)
+    return McqrHead(
+        network,
+        components,
+        learner,
+        torch.from_numpy(unit).float(),
+        torch.tensor(choice.kappa),
+        points,
+        setting,
+    )
+
+
+def _choice(learner: RegionLearner, examples: Examples, config: McqrConfig, seed: int) -> Choice:
+    """Return inflation and points of the codebook, on val and a sample of the training rows."""
+    generator = np.random.default_rng(seed)
+    copy = generator.integers(len(examples.x), size=_USAGE_ROWS)
+    row = generator.integers(examples.x.shape[1], size=_USAGE_ROWS)
     with torch.no_grad():
+        c = learner.standardise(torch.from_numpy(examples.x[copy, row]).float())
         val_c = learner.standardise(examples.val_x)
-    kappa = torch.tensor(config.kappa or best_kappa(learner.network, val_c, examples.val_y))
-    return McqrHead(network, components, learner, torch.from_numpy(unit).float(), kappa, setting)
+    kappas = KAPPAS if config.kappa is None else (config.kappa,)
+    return best_choice(learner.network, (c, examples.y[copy, row]), (val_c, examples.val_y), kappas)
 
 
 def _restore(setting: Setting, config: McqrConfig, state: Mapping[str, Tensor]) -> McqrHead:
     dropout = config.dropout if config.augmentation != "none" else 0.0
     point = PointNetwork(setting.feature_size, config.hidden, config.feature_noise, dropout)
+    learner = RegionLearner(config)
+    learner.network.keep(state["points"])
     head = McqrHead(
-        point, state["components"], RegionLearner(config), state["unit"], state["kappa"], setting
+        point,
+        state["components"],
+        learner,
+        state["unit"],
+        state["kappa"],
+        state["points"],
+        setting,
     )
     head.load_state_dict(state)
     return head

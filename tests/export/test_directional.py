@@ -1,0 +1,170 @@
+"""Directional quantiles: rays and half-spaces agree, regions hold what they should."""
+
+import numpy as np
+import pytest
+import torch
+
+from cvo_edge.conformal import conformal_quantile
+from cvo_export.directional import (
+    SHELLS,
+    Choice,
+    RegionConfig,
+    RegionNetwork,
+    best_choice,
+    fibonacci_sphere,
+    mean_volume,
+    scaled_distances,
+)
+from cvo_export.losses import pinball_loss
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(0)
+    return RegionNetwork(RegionConfig(response=6, condition=4)).eval()
+
+
+@pytest.fixture
+def condition():
+    return torch.randn(3, 4, generator=torch.Generator().manual_seed(1))
+
+
+def latents(network, c, kappa):
+    """Latents of the codebook, before they are decoded, (n, J, 3)."""
+    network._decoded = lambda z, c: z
+    with torch.no_grad():
+        return network.codebook(c, torch.tensor(kappa))
+
+
+def test_directions_are_unit_vectors_spread_over_the_sphere():
+    points = fibonacci_sphere(128)
+    torch.testing.assert_close(points.norm(dim=1), torch.ones(128))
+    assert points.mean(dim=0).abs().max() < 0.02
+    # No hole: everywhere on the sphere there is a direction within 15 degrees.
+    others = fibonacci_sphere(1000)
+    assert (others @ points.T).amax(dim=1).min() > np.cos(np.deg2rad(15.0))
+
+
+def test_the_codebook_fills_the_half_spaces_to_the_edge_and_not_beyond(network, condition):
+    z = latents(network, condition, 1.0)
+    with torch.no_grad():
+        quantile = network.quantile(condition, network.centre(condition))
+        above = z @ network.directions.T - quantile[:, None]
+    assert z.shape == (3, 1 + 128 * len(SHELLS), 3)
+    assert above.min() > -1e-4
+    # A ray's last point lies on the first half-space's border that it meets.
+    torch.testing.assert_close(above[:, -128:].amin(dim=2), torch.zeros(3, 128), atol=1e-4, rtol=0)
+    assert above[:, 0].min() > 0.0
+
+
+def test_kappa_inflates_about_the_centre(network, condition):
+    once, twice = latents(network, condition, 1.0), latents(network, condition, 2.0)
+    torch.testing.assert_close(once[:, :1], twice[:, :1])
+    torch.testing.assert_close(2.0 * (once - once[:, :1]), twice - twice[:, :1])
+
+
+def test_the_grid_has_points_inside_only_and_they_lie_in_all_half_spaces(network, condition):
+    network._decoded = lambda z, c: z
+    with torch.no_grad():
+        z, inside = network.grid_codebook(condition, side=9)
+        quantile = network.quantile(condition, network.centre(condition))
+    assert z.shape == (3, 9**3, 3)
+    assert (z @ network.directions.T - quantile[:, None]).min() > -1e-4
+    assert inside.any(dim=1).all()
+    assert not inside.all()
+
+
+def test_the_first_layer_split_in_two_is_the_decoder(network, condition):
+    with torch.no_grad():
+        codebook = network.codebook(condition, torch.tensor(0.8))
+        z = latents(network, condition, 0.8)
+        together = torch.cat([z, condition[:, None].expand(-1, z.shape[1], -1)], dim=2)
+        torch.testing.assert_close(codebook, network.decoder(together))
+
+
+def test_the_scale_is_lower_triangular_with_a_positive_diagonal(network, condition):
+    with torch.no_grad():
+        scale = network.scale(condition)
+    assert (scale.diagonal(dim1=1, dim2=2) > 0).all()
+    torch.testing.assert_close(scale, scale.tril())
+    assert scale.tril(-1).abs().max() > 0
+    constant = RegionNetwork(RegionConfig(response=6, condition=4, local_scale=False))
+    torch.testing.assert_close(constant.scale(condition), torch.eye(6).expand(3, 6, 6))
+
+
+@pytest.mark.parametrize("tau", [0.05, 0.5, 0.9])
+def test_the_constant_of_least_pinball_loss_is_the_quantile(tau):
+    y = torch.randn(20_001, generator=torch.Generator().manual_seed(0))
+    candidates = torch.linspace(-3, 3, 601)
+    losses = [pinball_loss(value.expand_as(y), y, tau) for value in candidates]
+    best = candidates[int(torch.stack(losses).argmin())]
+    assert best == pytest.approx(float(y.quantile(tau)), abs=0.02)
+
+
+def fitted(make, steps=400):
+    """A network fitted for a moment to y (n, 2) given x (n, 1)."""
+    torch.manual_seed(0)
+    generator = np.random.default_rng(0)
+    network = RegionNetwork(RegionConfig(response=2, condition=1))
+    optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
+    for _ in range(steps):
+        x, y = make(256, generator)
+        optimiser.zero_grad()
+        network.loss(torch.tensor(x).float(), torch.tensor(y).float()).backward()
+        optimiser.step()
+    return network.eval()
+
+
+def two_pieces(count, generator):
+    x = generator.uniform(0.0, 1.0, (count, 1))
+    side = generator.choice([-1.0, 1.0], (count, 1))
+    return x, side * (1.0 + 2.0 * x) + 0.2 * generator.standard_normal((count, 2))
+
+
+def test_a_region_of_two_pieces_covers_them_and_little_of_the_gap():
+    network = fitted(two_pieces)
+    generator = np.random.default_rng(1)
+    with torch.no_grad():
+        x, y = two_pieces(500, generator)
+        c = torch.tensor(x).float()
+        choice = best_choice(network, (c, y), (c, y))
+        network.keep(torch.from_numpy(choice.points))
+        codebook, scale = network.codebook(c, torch.tensor(choice.kappa)), network.scale(c)
+    assert codebook.shape == (500, len(choice.points), 2)
+    codebook, scale = codebook.double().numpy(), scale.double().numpy()
+    scores = scaled_distances(codebook, scale, y)
+    radius = conformal_quantile(scores[:400], 0.9)
+    assert (scores[400:] <= radius).mean() > 0.8
+    # A decoder is continuous: it may bridge the gap, but not fill it.
+    across = generator.uniform(-1.0, 1.0, y.shape) * (0.7 + 2.0 * x)
+    between = np.abs(across).max(axis=1) < 0.5 + 2.0 * x[:, 0]
+    assert (scaled_distances(codebook, scale, across)[between] <= radius).mean() < 0.1
+
+
+def test_the_scale_follows_what_the_condition_says_of_the_spread():
+    def spread(count, generator):
+        x = generator.uniform(0.0, 1.0, (count, 1))
+        return x, (0.2 + x) * generator.standard_normal((count, 2))
+
+    network = fitted(spread)
+    with torch.no_grad():
+        low, high = network.scale(torch.tensor([[0.0], [1.0]])).diagonal(dim1=1, dim2=2)
+    assert (high / low > 3.0).all()
+
+
+def test_the_mean_volume_is_in_units_of_the_response():
+    network = fitted(two_pieces, steps=30)
+    x, y = two_pieces(60, np.random.default_rng(3))
+    c = torch.tensor(x).float()
+    usual = Choice(0.8, np.arange(385))
+    assert mean_volume(network, c, y, usual) > mean_volume(network, c, 0.1 * y, usual)
+
+
+def test_points_that_no_response_is_near_are_left_out():
+    network = fitted(two_pieces)
+    x, y = two_pieces(2000, np.random.default_rng(4))
+    c = torch.tensor(x).float()
+    chosen = best_choice(network, (c, y), (c[:300], y[:300]))
+    everything = Choice(chosen.kappa, np.arange(385))
+    assert 0 < len(chosen.points) < 385
+    assert mean_volume(network, c, y, chosen) < mean_volume(network, c, y, everything)
