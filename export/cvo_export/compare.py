@@ -219,7 +219,7 @@ def run_cell(out: Path, features: Path, config: TrainConfig) -> None:
         options=_digest(config),
         bundle=calibration.digest,
         score=report["score"],
-        frames={name: report["frames"][name] for name in ("total", "invalid")},
+        frames={key: report["frames"][key] for key in ("total", "invalid")},
         marginal=_figures(find_level(report["levels"], _CONFIDENCE, "marginal")),
         joint=_figures(joint),
         own=None if report["own"] is None else _figures(report["own"]),
@@ -359,7 +359,7 @@ def _timing(out: Path, cells: Mapping[str, Cell], dataset: PoseDataset) -> Timin
             stored = msgspec.json.decode(path.read_bytes(), type=Timing)
         except msgspec.DecodeError as error:
             raise UsageError(f"{path}: expected timings, found {error}") from None
-        if stored.bundles == bundles:
+        if bundles.items() <= stored.bundles.items():
             return stored
     folders = {method: out / BUNDLES_FOLDER / _cell_name(method, 0) for method in cells}
     timing = Timing(bundles, allowed_cores(), _frame_ms(folders, dataset))

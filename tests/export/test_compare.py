@@ -215,5 +215,6 @@ def test_bundles_are_timed_again_when_one_has_changed(copied, options, monkeypat
     for _ in range(2):
         lines, _ = compared_again(copied, options)
         assert sum("1.25 (2.50)" in line for line in lines) == 2
+    compared_again(copied, options, methods=["gaussian"])
     assert timed == [["gaussian-0", "split-0"]]
     assert json.loads(path.read_text())["bundles"]["split"] == cell(copied, "split-0")["bundle"]

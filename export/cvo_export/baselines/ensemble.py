@@ -1,8 +1,9 @@
 """A deep ensemble: the spread of five point networks that began differently.
 
 After Lakshminarayanan, Pritzel and Blundell 2017: each member is trained on all the data from an
-initialisation of its own, and their answers are taken as a Gaussian. The members share the batches
-of one lesson, but not the noise on the features.
+initialisation of its own, and their answers are taken as a Gaussian. Theirs have variances of their
+own, too; here the interval is of the spread alone. The members share the batches of one lesson, but
+not the noise on the features.
 """
 
 from __future__ import annotations

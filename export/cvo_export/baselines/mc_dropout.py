@@ -1,8 +1,8 @@
 """Monte Carlo dropout: the spread of one network's answers under 30 dropout masks.
 
 After Gal and Ghahramani 2016: dropout stays on at inference, and mean and variance of the passes
-are those of a Gaussian. Their constant 1/tau, the variance of the observations, is not added: what
-is left is the spread alone, as in common use. The 30 masks are drawn once, from the run's seed, so
+are those of a Gaussian. Their constant 1/tau, the variance of the observations, is not added: the
+interval is of the spread alone. The 30 masks are drawn once, from the run's seed, so
 that the same image has the same answer; backbone and first layer are computed once a frame.
 """
 
