@@ -124,8 +124,8 @@ class Regions:
         """Area or volume of the region at each condition (n, 1)."""
         _, scale, used = self.points(x)
         areas = [
-            math.exp(union_log_volume(p, self.radius)) * np.diag(b).prod()
-            for p, b in zip(used, scale, strict=True)
+            math.exp(union_log_volume(p, self.radius, seed)) * np.diag(b).prod()
+            for seed, (p, b) in enumerate(zip(used, scale, strict=True))
         ]
         return np.array(areas)
 

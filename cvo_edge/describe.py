@@ -93,7 +93,9 @@ def _unbounded(calibration: Calibration) -> list[str]:
         needed = math.ceil(level / (1.0 - level) - 1e-9)
         reason = f"needs at least {needed} calibration {unit}, has {given}"
         if given >= needed:
-            reason = "too many calibration truths lie outside the workspace of the classes"
+            reason = "too many calibration truths have an infinite score"
+            if calibration.method == "csp":
+                reason = "too many calibration truths lie outside the workspace of the classes"
         lines.append(f"unbounded    at {entry.confidence:g} {entry.scope}: {reason}")
     return lines
 

@@ -61,10 +61,13 @@ class Pose:
     @classmethod
     def from_array(cls, pose: ArrayLike) -> Pose:
         """Shape (7,): tx ty tz qx qy qz qw -> Pose; raises UsageError where it is none."""
-        values = np.asarray(pose, dtype=np.float64)
+        try:
+            values = np.asarray(pose, dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.empty(0)
         if values.shape != (7,) or not np.isfinite(values).all() or not values[3:].any():
             raise UsageError(
-                f"pose: expected 7 finite numbers tx ty tz qx qy qz qw, found {values.tolist()}"
+                f"pose: expected 7 finite numbers tx ty tz qx qy qz qw, found {str(pose)[:80]}"
             )
         return cls(values[:3].copy(), geometry.quaternion_normalise(values[3:]))
 

@@ -69,9 +69,10 @@ def make_head(bundle: Bundle) -> Callable[..., Head]:
         q_hat: Any = (None,) * 6,
         q_hat_upper: Any = None,
         scope: Scope = "marginal",
+        joint: str = "max",
     ) -> Head:
         entry = Threshold(confidence=0.9, scope=scope, q_hat=q_hat, q_hat_upper=q_hat_upper)
-        source = msgspec.structs.replace(bundle.calibration.calibration, score=score)
+        source = msgspec.structs.replace(bundle.calibration.calibration, score=score, joint=joint)
         calibration: Calibration = msgspec.structs.replace(
             bundle.calibration,
             method=method,

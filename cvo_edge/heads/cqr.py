@@ -130,13 +130,9 @@ class CqrHead:
                 raise CalibrationFileError(
                     f"thresholds.{side}: expected null with {sides} sides, found numbers"
                 )
-        smallest = min(q for t in calibration.thresholds for q in (*t.q_hat, 0.0) if q is not None)
-        # The larger of two opposite scores is never negative.
-        if symmetric and score != "additive" and smallest < 0.0:
-            raise CalibrationFileError(
-                f"thresholds.q_hat: expected factors of at least 0 for the {score} score, "
-                f"found {smallest}"
-            )
+        if symmetric and score != "additive":
+            for entry in calibration.thresholds:
+                refuse_negative(entry, score)
 
     def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
         """Nothing: the image is the only input."""
@@ -181,6 +177,16 @@ class CqrHead:
         if not self._bounds:
             return point, point
         return outputs["lower"].astype(np.float64), outputs["upper"].astype(np.float64)
+
+
+def refuse_negative(entry: Threshold, what: str) -> None:
+    """Raise CalibrationFileError for a negative q_hat: of two opposite scores the larger is not."""
+    smallest = min(q for q in (*entry.q_hat, 0.0) if q is not None)
+    if smallest < 0.0:
+        raise CalibrationFileError(
+            f"thresholds.q_hat: expected factors of at least 0 for {what}, found {smallest} at "
+            f"{entry.confidence} {entry.scope}"
+        )
 
 
 def infinite_where_null(q_hat: SixOrUnbounded) -> Array:

@@ -1,9 +1,9 @@
 """Multivariate conformalized quantile regression (MCQR): one region for all six degrees of freedom.
 
-The model gives a codebook y_1 .. y_J, points that fill a 90 % region of the residual (directional
-quantiles in the latent space of a conditional variational autoencoder, Feldman, Bates and Romano
-2021, decoded along fixed rays), and a lower triangular scale matrix B, which says how errors of
-this frame spread and lean. The nonconformity score of a truth y is its scaled distance
+The model gives a codebook y_1 .. y_J, points that fill a region where residuals are likely
+(directional quantiles in the latent space of a conditional variational autoencoder, Feldman, Bates
+and Romano 2021, decoded along fixed rays), and a lower triangular scale matrix B, which says how
+errors of this frame spread and lean. The nonconformity score of a truth y is its scaled distance
 
     s = min_j |B^-1 (y - y_j)|
 
@@ -29,12 +29,15 @@ from numpy.typing import NDArray
 from cvo_edge.artifact import Calibration, SixPositive, Threshold
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
-from cvo_edge.heads.cqr import IntervalScore, infinite_where_null
-from cvo_edge.pose import ConformalSet, Ellipsoids, Scope, scaled_distance
+from cvo_edge.heads.cqr import IntervalScore, infinite_where_null, refuse_negative
+from cvo_edge.pose import ConformalSet, Ellipsoids, Scope, scaled_distance, unbounded_set
 
 Array = NDArray[np.float64]
 
 _SCORES = ("normalised", "additive")
+_HAIR = 1e-12
+# Frames whose distances are computed at a time: each has J differences.
+_BLOCK = 500
 
 
 class McqrParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -61,6 +64,11 @@ class McqrHead:
             raise CalibrationFileError(
                 f"calibration.score: expected one of {', '.join(_SCORES)} for mcqr, found {score!r}"
             )
+        if calibration.calibration.joint != "max":
+            raise CalibrationFileError(
+                "calibration.joint: expected max for mcqr, which has one score for all six, found "
+                f"{calibration.calibration.joint}"
+            )
         normalised = score == "normalised"
         self._score = IntervalScore(np.array(parameters.half_width_floor) if normalised else None)
         self.outputs: Mapping[str, tuple[int, ...]] = {
@@ -74,12 +82,14 @@ class McqrHead:
                     "thresholds.q_hat_upper: expected null for mcqr, found more"
                 )
             radius = entry.q_hat[0]
+            if normalised:
+                refuse_negative(entry, "mcqr")
             if entry.scope == "joint" and not (
                 entry.q_hat == (radius,) * 6 and (radius is None or radius >= 0.0)
             ):
                 raise CalibrationFileError(
                     "thresholds.q_hat: expected one distance of at least 0, six times, for mcqr "
-                    f"and scope joint, found {list(entry.q_hat)}"
+                    f"and scope joint, found {list(entry.q_hat)} at {entry.confidence}"
                 )
 
     def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
@@ -105,9 +115,12 @@ class McqrHead:
 
         Marginal: of each DoF against the raw hull. Joint: the scaled distance, six times.
         """
-        codebook, scale = outputs["codebook"], outputs["scale"].astype(np.float64)
+        codebook, scale = outputs["codebook"], np.tril(outputs["scale"].astype(np.float64))
         if scope == "joint":
-            distance = scaled_distance(codebook, scale, truth)
+            blocks = np.array_split(np.arange(len(truth)), len(truth) // _BLOCK + 1)
+            distance = np.concatenate(
+                [scaled_distance(codebook[rows], scale[rows], truth[rows]) for rows in blocks]
+            )
             return np.tile(distance[:, np.newaxis, np.newaxis], (1, 1, 6))
         extent = np.linalg.norm(scale, axis=2)
         lower = codebook.min(axis=1).astype(np.float64) - extent
@@ -119,16 +132,20 @@ class McqrHead:
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Outputs of one frame -> its region and hull, or six intervals; point is not needed."""
-        codebook = outputs["codebook"][0]
-        scale = outputs["scale"][0].astype(np.float64)
         q_hat = infinite_where_null(threshold.q_hat)
+        radius = float(q_hat[0])
+        if threshold.scope == "joint" and radius == np.inf:
+            return unbounded_set()
+        codebook = outputs["codebook"][0]
+        scale = np.tril(outputs["scale"][0].astype(np.float64))
         lowest = codebook.min(axis=0).astype(np.float64)
         highest = codebook.max(axis=0).astype(np.float64)
         extent = np.sqrt((scale * scale).sum(axis=1))
         if threshold.scope == "joint":
-            radius = float(q_hat[0])
-            reach = radius * extent
-            ellipsoids = Ellipsoids(codebook, scale, radius) if np.isfinite(radius) else None
+            # A hair more, so that no rounding leaves a point of the region outside of its hull.
+            furthest = np.maximum(np.abs(lowest), np.abs(highest))
+            reach = radius * extent * (1.0 + _HAIR) + _HAIR * furthest
+            ellipsoids = Ellipsoids(codebook, scale, radius)
             return ConformalSet(lowest - reach, highest + reach, ellipsoids=ellipsoids)
         lower, upper = lowest - extent, highest + extent
         return self._score.inverse(lower, upper, 0.5 * (lower + upper), q_hat, q_hat)

@@ -259,7 +259,7 @@ def train(
         IntervalFormName | None, typer.Option(help="cjp: proper by default; mean: the paper's.")
     ] = None,
     kl_weight: Annotated[
-        float | None, typer.Option(min=0, help="cjp: beta of the divergence, 0.001.")
+        float | None, typer.Option(min=0, help="beta of the divergence; cjp: 0.001, mcqr: 0.01.")
     ] = None,
     quantiles: Annotated[
         tuple[float, float] | None,
@@ -284,7 +284,7 @@ def train(
     ] = None,
     residuals: Annotated[
         ResidualsName | None,
-        typer.Option(help="cqr: cross_fitted below 1500 frames by default, else held_out."),
+        typer.Option(help="cqr, mcqr: cross_fitted below 1500 frames by default, else held_out."),
     ] = None,
     forest_copies: Annotated[
         int | None, typer.Option(min=0, help="cqr: augmented copies among the forest's rows.")

@@ -111,10 +111,11 @@ class Cell(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Timing(Struct, frozen=True, forbid_unknown_fields=True):
-    """Milliseconds from array to interval; digests of the bundles that were timed."""
+    """Milliseconds from array to interval; digests of the bundles, and where they were timed."""
 
     bundles: dict[str, str]
     threads: int
+    environment: dict[str, Any]
     ms: dict[str, dict[str, float]]
 
 
@@ -189,7 +190,6 @@ def compare(
             if key not in ("dataset", "weights", "head", "seed")
         },
         "confidence": _CONFIDENCE,
-        "environment": environment(timing.threads),
         "versions": versions(("cvo-edge", "cvo-export", "torch", "timm", "onnx", "scikit-learn")),
         "timing": timing,
         "cells": cells,
@@ -362,7 +362,8 @@ def _timing(out: Path, cells: Mapping[str, Cell], dataset: PoseDataset) -> Timin
         if bundles.items() <= stored.bundles.items():
             return stored
     folders = {method: out / BUNDLES_FOLDER / _cell_name(method, 0) for method in cells}
-    timing = Timing(bundles, allowed_cores(), _frame_ms(folders, dataset))
+    threads = allowed_cores()
+    timing = Timing(bundles, threads, environment(threads), _frame_ms(folders, dataset))
     _write(path, _json(timing))
     return timing
 

@@ -17,8 +17,9 @@ is a region; decoded, it may be a ring, a banana or two pieces. What is ours:
 - the region is not a grid but a codebook of one size: rays from the centre, cut where they leave
   the region, times kappa, at three shells. ``grid`` codebooks, as in the paper, are there to check
   it: all points of a latent grid that lie inside;
-- points that are the nearest to hardly any training response are left out: they stand where the
-  ball in latent space covers a gap, such as the middle of a ring.
+- where that makes val's regions smaller, points that are the nearest to hardly any training
+  response are left out: they stand where the ball in latent space covers a gap, such as the middle
+  of a ring.
 """
 
 from __future__ import annotations
@@ -146,7 +147,8 @@ class RegionNetwork(nn.Module):
     def grid_codebook(self, c: Tensor, side: int = 16) -> tuple[Tensor, Tensor]:
         """All points of a latent grid, decoded, (n, side^3, d), and which are inside, (n, side^3).
 
-        As in the paper, the grid spans what training latents span. Points outside are the centre.
+        Instead of the range of training latents, as in the paper, the grid spans the reach of the
+        region's furthest ray. Points outside are put at the centre.
         """
         centre = self.centre(c)
         reach = self._reach(c)
@@ -238,7 +240,7 @@ def mean_volume(
     codebook = network.codebook(c, torch.tensor(choice.kappa)).double().numpy()
     codebook, scale = codebook[:, choice.points], network.scale(c).double().numpy()
     radius = conformal_quantile(scaled_distances(codebook, scale, y), 0.9)
-    volumes = [union_log_volume(points, radius, draws) for points in codebook]
+    volumes = [union_log_volume(points, radius, row, draws) for row, points in enumerate(codebook)]
     determinants = np.log(np.diagonal(scale, axis1=1, axis2=2)).sum(axis=1)
     return math.exp(float((np.array(volumes) + determinants).mean()) / y.shape[1])
 

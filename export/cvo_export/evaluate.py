@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,13 +23,16 @@ from cvo_edge.pose import ConformalSet
 from cvo_export.calibrate import Observed, Rule, effective_frames, observe, thresholds, workspace
 from cvo_export.datasets import PoseDataset
 from cvo_export.splits import Split, same_split
-from cvo_export.volume import ellipsoids_volume
+from cvo_export.volume import ellipsoids_log_volume
 
 Array = NDArray[np.float64]
 Subset = Literal["test", "all"]
 
 # The band that a valid method's coverage stays in with this probability.
 _BAND_PROBABILITY = 0.99
+
+_LEAST_WIDTH = 1e-3
+_LARGEST_LOG = 700.0
 
 
 def evaluate(
@@ -118,15 +122,18 @@ def point_error(seen: Observed) -> dict[str, float]:
     }
 
 
-def region_volume(region: ConformalSet, deviation: Array) -> float:
-    """Volume of the region in which all six degrees of freedom lie, in standardised units.
+def region_log_volume(region: ConformalSet, deviation: Array, seed: int) -> float:
+    """Logarithm of the volume in which all six degrees of freedom lie, in standardised units.
 
     The product of six sets, or a union of ellipsoids. ``deviation`` (6,): standard deviation of
-    each degree of freedom's poses, m and rad.
+    each degree of freedom's poses, m and rad; ``seed`` of the estimate, one for each frame. A set
+    without width counts as a thousandth of the deviation: a single one would make all volumes 0.
     """
-    if region.ellipsoids is not None:
-        return ellipsoids_volume(region.ellipsoids) / float(deviation.prod())
-    return float((region.width() / deviation).prod())
+    box = np.log(np.maximum(region.width() / deviation, _LEAST_WIDTH)).sum()
+    if region.ellipsoids is None:
+        return float(box)
+    ellipsoids = ellipsoids_log_volume(region.ellipsoids, seed) - np.log(deviation).sum()
+    return float(min(ellipsoids, box))
 
 
 def coverage_band(n_calibration: int, n_test: int, confidence: float) -> list[float] | None:
@@ -258,6 +265,11 @@ class _Sets:
     def calibration(self) -> Calibration:
         return self.odometer.calibration
 
+    @cached_property
+    def effective(self) -> float:
+        """Independent frames that the observed ones are worth."""
+        return effective_frames(self.seen.scored(self.odometer.head))
+
     @property
     def deviation(self) -> Array:
         return np.array(self.calibration.pose.standard_deviation)
@@ -283,7 +295,6 @@ class _Sets:
         one_bound = len(used) < len(self.odometer.head.side_confidences(0.9))
         # A single bound is penalised by 1/alpha, an interval by 2/alpha.
         alpha = (1.0 - entry.confidence) * (2.0 if one_bound else 1.0)
-        effective_test = effective_frames(self.seen.scored(self.odometer.head))
         # The band is that of one order statistic of frames: it says nothing of a rule that counts
         # sequences, of two thresholds a set, or of six that hold together by Bonferroni.
         finite = (
@@ -300,7 +311,7 @@ class _Sets:
             "coverage_band": coverage_band(n, n_test, entry.confidence) if finite else None,
             "coverage_band_effective": coverage_band(
                 max(1, int(self.calibration.calibration.n_effective)),
-                max(1, int(effective_test)),
+                max(1, int(self.effective)),
                 entry.confidence,
             )
             if finite
@@ -327,14 +338,16 @@ class _Sets:
 
     def volumes(self, regions: list[ConformalSet]) -> dict[str, Any]:
         """Return volumes of the joint sets of all frames, bounded, in standardised units."""
-        volume = np.array([region_volume(region, self.deviation) for region in regions])
-        with np.errstate(divide="ignore"):  # a set without width has none
-            logarithm = np.log(volume)
+        logarithm = np.array(
+            [region_log_volume(r, self.deviation, seed) for seed, r in enumerate(regions)]
+        )
+        # No number of JSON is larger.
+        volume = np.exp(np.minimum(logarithm, _LARGEST_LOG))
         return {
             "joint_volume": {
                 "mean": float(volume.mean()),
                 "median": float(np.median(volume)),
-                "geometric_mean": float(np.exp(logarithm.mean())),
+                "geometric_mean": float(np.exp(min(logarithm.mean(), _LARGEST_LOG))),
             }
         }
 

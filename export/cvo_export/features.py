@@ -56,6 +56,10 @@ class ModelImages:
     def __len__(self) -> int:
         return len(self.images)
 
+    def digest(self) -> str:
+        """sha256 of all pixels."""
+        return hashlib.sha256(self.images.tobytes()).hexdigest()
+
     def augmented(
         self, row: int, config: AugmentConfig, generator: np.random.Generator
     ) -> tuple[Image, Array]:
@@ -89,8 +93,7 @@ def cached_features(
     folder: Path, images: ModelImages, extractor: FeatureExtractor
 ) -> NDArray[np.float32]:
     """Features (n, size) of images as they are, kept in a file named for their pixels."""
-    digest = hashlib.sha256(images.images.tobytes()).hexdigest()[:24]
-    path = folder / f"frames-{digest}.npz"
+    path = folder / f"frames-{images.digest()[:24]}.npz"
     found = _stored(path, len(images))
     if found is None:
         found = {"features": np.stack([extractor(image) for image in images.images])}

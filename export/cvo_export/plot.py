@@ -136,7 +136,9 @@ def _draw_dof(
             bottoms.append(bottom)
             heights.append(top - bottom)
             places.append(row)
-        if not estimate.region.covers(truth[row])[dof]:
+        # A region of all six misses as a whole.
+        whole = estimate.region.ellipsoids
+        if not (whole.contains(truth[row]) if whole else estimate.region.covers(truth[row])[dof]):
             missed.append(row)
     axes.bar(places, heights, 1.0, bottoms, color=_BAND, alpha=0.6, linewidth=0, label="set")
     axes.plot(rows, scale * point, color=_POINT, linewidth=0.9, label="point")

@@ -169,6 +169,7 @@ def _draft(
                 **_options(run),
                 "network": config.method,
                 "lesson": run.best.lesson,
+                **{f"chosen.{key}": value for key, value in run.graph.head.choices().items()},
                 "parity": float(f"{parity:.3g}"),
             },
         ),

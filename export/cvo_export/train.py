@@ -28,7 +28,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cvo_edge.errors import UsageError
 from cvo_export.backbone import Backbone, load_weights
-from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.datasets import open_dataset
 from cvo_export.features import FeatureExtractor, ModelImages, cached_copies, cached_features
 from cvo_export.heads import Setting
 from cvo_export.heads.base import Examples, L, Learner
@@ -49,6 +49,9 @@ FEATURES_FOLDER = "features"
 _EVALUATIONS = 40
 _PATIENCE = 20
 
+# Fewer scores support no finite threshold at 0.9.
+_LEAST_VAL = 9
+
 # An image costs the backbone a hundred times what its features cost the head.
 _IMAGE_BATCH = 16
 
@@ -59,9 +62,15 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     Features of the pretrained network are kept in the run's folder, or in a folder of ``cache``
     that all runs with the same frames, network and augmentation share.
 
-    Raises UsageError where ``run_dir`` holds another configuration.
+    Raises UsageError where ``run_dir`` holds another configuration, or where val has too few frames
+    to decide anything.
     """
     dataset, split = open_run(run_dir, config)
+    if split.roles["val"].size < _LEAST_VAL:
+        raise UsageError(
+            f"{config.dataset}: expected at least {_LEAST_VAL} frames of the role val, which "
+            f"decides by intervals of 0.9, found {split.roles['val'].size}"
+        )
     torch.manual_seed(config.seed)
     backbone = Backbone(config.backbone, config.height, config.width)
     weights_sha256 = load_weights(backbone, config.weights)
@@ -69,10 +78,11 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     target = fit_target(dataset.poses[indices])
     claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
+    images = ModelImages(dataset, indices, *size)
     # Random weights are the run's own.
     features_folder = run_dir / f"{FEATURES_FOLDER}-0"
     if cache is not None and weights_sha256 is not None:
-        features_folder = _shared_folder(cache, config, weights_sha256, dataset, indices)
+        features_folder = _shared_folder(cache, config, weights_sha256, images)
     trainer = _Trainer(
         _Material(
             run_dir,
@@ -80,7 +90,7 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
             config,
             backbone,
             target,
-            ModelImages(dataset, indices, *size),
+            images,
             ModelImages(dataset, split.roles["val"], *size),
             progress,
         ),
@@ -106,13 +116,14 @@ def prepare_features(config: TrainConfig, cache: Path, progress: Progress) -> No
     weights_sha256 = load_weights(backbone, config.weights)
     if weights_sha256 is None:
         return
-    folder = _shared_folder(cache, config, weights_sha256, dataset, indices)
     size = (config.height, config.width, config.crop)
+    images = ModelImages(dataset, indices, *size)
+    folder = _shared_folder(cache, config, weights_sha256, images)
     extractor = FeatureExtractor(backbone, config.height, config.width)
     cached_features(folder, ModelImages(dataset, split.roles["val"], *size), extractor)
     cached_copies(
         folder,
-        ModelImages(dataset, indices, *size),
+        images,
         extractor,
         config.augment,
         config.copies,
@@ -329,7 +340,7 @@ class _Lesson:
         averaging = get_ema_multi_avg_fn(config.averaging)  # type: ignore[no-untyped-call]
         learning = self._learning(phase)
         averaged = AveragedModel(learning, multi_avg_fn=averaging)
-        best: dict[str, Any] = {"score": math.inf, "weights": learning.state_dict(), "count": 0}
+        best: dict[str, Any] = {"score": math.inf, "weights": _cloned(learning), "count": 0}
         start = 0
         if state is not None:
             optimiser.load_state_dict(state["optimiser"])
@@ -356,8 +367,7 @@ class _Lesson:
                 with torch.no_grad():
                     score = learner.val_score(*val(module))
                 if score < best["score"]:
-                    weights = {key: value.clone() for key, value in module.state_dict().items()}
-                    best = {"score": score, "weights": weights, "count": 0}
+                    best = {"score": score, "weights": _cloned(module), "count": 0}
                 else:
                     best["count"] += 1
                 self.history.append(History(self.name, phase, step + 1, value.item(), float(score)))
@@ -423,24 +433,27 @@ def _training_frames(split: Split) -> Indices:
 
 
 def _shared_folder(
-    cache: Path, config: TrainConfig, weights_sha256: str, dataset: PoseDataset, indices: Indices
+    cache: Path, config: TrainConfig, weights_sha256: str, images: ModelImages
 ) -> Path:
-    """Where the pretrained network's features of these frames are kept in a shared cache.
+    """Where the pretrained network's features of these images are kept in a shared cache.
 
-    The name is a digest of everything that decides them, but for the pixels.
+    The name is a digest of everything that decides them.
     """
     decisive = {
         "weights": weights_sha256,
         "backbone": msgspec.to_builtins(config.backbone),
         "image": [config.height, config.width, config.crop],
         "augment": [msgspec.to_builtins(config.augment), config.copies, config.seed],
-        "dataset": dataset.name,
-        "intrinsics": dataset.intrinsics,
-        "frames": [dataset.frame_names[index] for index in indices.tolist()],
-        "poses": dataset.poses[indices].tolist(),
+        "intrinsics": None if images.K is None else images.K.tolist(),
+        "pixels": images.digest(),
+        "poses": images.poses.tolist(),
     }
     text = json.dumps(decisive, sort_keys=True)
     return cache / hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def _cloned(module: nn.Module) -> dict[str, Tensor]:
+    return {key: value.clone() for key, value in module.state_dict().items()}
 
 
 @contextmanager

@@ -334,6 +334,48 @@ def test_the_hull_touches_the_region_on_all_twelve_sides(make_head):
         assert region.ellipsoids.distance(top) == pytest.approx(1.5, abs=1e-6)
 
 
+def test_the_hull_holds_the_furthest_points_to_the_last_bit(make_head):
+    head = make_head("mcqr", "normalised", POINTS)
+    for seed in range(40):
+        outputs = codebooks(seed)
+        codebook, scale = outputs["codebook"][0].astype(float), outputs["scale"][0].astype(float)
+        for dof in range(6):
+            furthest = codebook[codebook[:, dof].argmax()] + scale @ scale[dof] / np.linalg.norm(
+                scale[dof]
+            )
+            radius = float(scaled_distance(outputs["codebook"][0], scale, furthest))
+            region = head.region(outputs, np.zeros(6), threshold([radius] * 6, scope="joint"))
+            assert region.contains(furthest)
+            assert region.covers(furthest).all()
+
+
+def test_no_radius_is_everything_even_without_extent(make_head):
+    outputs = codebooks(0)
+    outputs["scale"][0, 2] = 0.0
+    head = make_head("mcqr", "normalised", POINTS)
+    region = head.region(outputs, np.zeros(6), threshold([None] * 6, scope="joint"))
+    assert region.contains(np.full(6, 1e9))
+    assert region.covers(np.full(6, -1e9)).all()
+    assert (region.lower == -np.inf).all()
+
+
+def test_what_is_above_the_diagonal_counts_nowhere(make_head):
+    head = make_head("mcqr", "normalised", POINTS)
+    plain, outputs = codebooks(8), codebooks(8)
+    outputs["scale"][0, 0, 5] = 0.3
+    y = near(plain, 9, 50)
+    for scope in ("marginal", "joint"):
+        one, other = (
+            head.region(given, np.zeros(6), threshold([1.0] * 6, scope=scope))
+            for given in (plain, outputs)
+        )
+        np.testing.assert_array_equal(one.upper, other.upper)
+        for truth in y:
+            assert one.contains(truth) == other.contains(truth)
+            scores = [head.scores(g, y[:1], truth[None], scope) for g in (plain, outputs)]
+            np.testing.assert_array_equal(*scores)
+
+
 @pytest.mark.parametrize("score", ["additive", "normalised"])
 @pytest.mark.parametrize("q_hat", [0.0, 0.3, 1.7])
 def test_six_intervals_on_the_raw_hull_are_where_the_marginal_score_is_at_most_q(
@@ -373,6 +415,8 @@ def test_region_scores_of_stacked_frames_are_those_of_each_to_the_last_bit(make_
         ({"q_hat": (1.0,) * 5 + (1.1,), "scope": "joint"}, "six times"),
         ({"q_hat": (1.0,) * 5 + (None,), "scope": "joint"}, "six times"),
         ({"q_hat": (-1.0,) * 6, "scope": "joint"}, "at least 0"),
+        ({"q_hat": (1.0,) * 5 + (-0.5,)}, "factors of at least 0"),
+        ({"joint": "bonferroni"}, "one score for all six"),
     ],
 )
 def test_parameters_and_thresholds_that_are_no_region_are_refused(make_head, changes, match):

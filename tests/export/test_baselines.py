@@ -193,13 +193,17 @@ def test_dropout_masks_keep_their_share_and_come_from_the_seed():
     assert not torch.equal(network.wide_masks, other.wide_masks)
 
 
-def test_ensemble_bounds_are_those_of_five_networks_one_by_one(seen):
+def test_ensemble_bounds_are_those_of_the_mixture_of_five_networks_one_by_one(seen):
     run, features, outputs = seen("ensemble")
     network = run.graph.head.network
     x = network.standardise.eval()(features)
-    points = np.array([member(x).detach().numpy() for member in network.members])
-    assert len(points) == 5
-    assert_bounds(run, outputs, gaussian_of(points))
+    found = np.array([member(x).detach().numpy() for member in network.members]).astype(float)
+    mean, variance = found[..., :6], np.exp(found[..., 6:])
+    assert len(mean) == 5
+    # Second moment of the mixture less the square of its mean.
+    deviation = np.sqrt((variance + mean**2).mean(axis=0) - mean.mean(axis=0) ** 2)
+    point = mean.mean(axis=0)
+    assert_bounds(run, outputs, (point - Z * deviation, point + Z * deviation))
 
 
 def test_members_of_the_ensemble_differ_in_initialisation_and_noise(runs):
@@ -210,7 +214,7 @@ def test_members_of_the_ensemble_differ_in_initialisation_and_noise(runs):
     for member in network.members:
         member.load_state_dict(network.members[0].state_dict())
     features = torch.zeros((4, run.graph.backbone.size))
-    alike, noisy = network.eval().points(features), network.train().points(features)
+    alike, noisy = network.eval().moments(features)[0], network.train().moments(features)[0]
     network.eval()
     assert torch.equal(alike[:, 0], alike[:, 1])
     assert not torch.equal(noisy[:, 0], noisy[:, 1])

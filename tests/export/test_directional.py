@@ -152,12 +152,16 @@ def test_the_scale_follows_what_the_condition_says_of_the_spread():
     assert (high / low > 3.0).all()
 
 
-def test_the_mean_volume_is_in_units_of_the_response():
-    network = fitted(two_pieces, steps=30)
-    x, y = two_pieces(60, np.random.default_rng(3))
-    c = torch.tensor(x).float()
-    usual = Choice(0.8, np.arange(385))
-    assert mean_volume(network, c, y, usual) > mean_volume(network, c, 0.1 * y, usual)
+def test_a_region_that_is_no_larger_than_its_radius_has_the_volume_of_discs():
+    # Without a local scale and with one point: a disc about it, whose radius covers 90 %.
+    torch.manual_seed(0)
+    network = RegionNetwork(RegionConfig(response=2, condition=1, local_scale=False)).eval()
+    c, y = torch.zeros(100, 1), np.random.default_rng(3).standard_normal((100, 2))
+    with torch.no_grad():
+        centre = network.codebook(c[:1], torch.tensor(1.0))[0, 0].numpy()
+    radius = conformal_quantile(np.linalg.norm(y - centre, axis=1), 0.9)
+    found = mean_volume(network, c, y, Choice(1.0, np.array([0])))
+    assert found == pytest.approx(np.sqrt(np.pi) * radius, rel=1e-4)
 
 
 def test_points_that_no_response_is_near_are_left_out():

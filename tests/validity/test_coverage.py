@@ -173,6 +173,13 @@ def test_sets_and_their_hulls_cover_at_least_that_and_joint_sets_all_six(
     assert jointly > least - 4.5 * standard_error(least, n, columns=1, trials=JUDGED)
 
 
+@pytest.mark.parametrize("n", [19, 20, 100])
+def test_a_region_covers_neither_less_nor_more_than_its_rank_says(make_head, n):
+    _, _, jointly = coverages(make_head("mcqr", "normalised", REGION), n)
+    expected = conformal_rank(n, CONFIDENCE) / (n + 1)
+    assert abs(jointly - expected) < 4.5 * standard_error(expected, n, columns=1, trials=JUDGED)
+
+
 @pytest.mark.parametrize("n", [20, 100])
 @pytest.mark.parametrize(("method", "score", "parameters"), [METHODS[1], METHODS[4]])
 def test_bonferroni_holds_jointly_or_says_that_it_cannot(make_head, method, score, parameters, n):

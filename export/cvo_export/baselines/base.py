@@ -30,6 +30,7 @@ from cvo_export.heads.base import (
     conformalised_score,
     dense,
     half_width_floor,
+    interval_candidates,
 )
 from cvo_export.losses import HIGH
 from cvo_export.target import PoseDecoder
@@ -91,10 +92,7 @@ class IntervalHead(ExportedHead):
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Normalised before additive: factors carry over to harder or easier recordings."""
-        return (
-            Candidate("normalised", self._method_parameters),
-            Candidate("additive", self._method_parameters),
-        )
+        return interval_candidates(self._method_parameters)
 
 
 def interval_method(
@@ -135,7 +133,14 @@ def gaussian_interval(mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor, 
     return mean, mean - Z * deviation, mean + Z * deviation
 
 
-def interval_of_spread(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Points of several networks (n, count, 6) -> point, lower, upper (n, 6), as if Gaussian."""
-    mean = points.mean(dim=1)
-    return gaussian_interval(mean, (points - mean[:, None]).square().mean(dim=1).sqrt())
+def moments(outputs: Tensor) -> tuple[Tensor, Tensor]:
+    """Outputs of a trunk (..., 12) -> mean and log variance (..., 6)."""
+    mean, log_variance = outputs[..., :DOF], outputs[..., DOF:]
+    # Beyond +-10 a variance is zero or infinite in float32; early steps do go there.
+    return mean, log_variance.clamp(-10.0, 10.0)
+
+
+def gaussian_loss(mean: Tensor, log_variance: Tensor, y: Tensor) -> Tensor:
+    """Negative log likelihood up to a constant, mean over all; shapes (..., 6)."""
+    terms = 0.5 * (log_variance + (y - mean).square() * (-log_variance).exp())
+    return terms.mean()

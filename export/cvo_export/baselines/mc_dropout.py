@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from cvo_export.baselines.base import (
     IntervalNetwork,
     TrunkConfig,
+    gaussian_interval,
     interval_method,
-    interval_of_spread,
     trunk,
 )
 from cvo_export.heads.base import Setting
@@ -59,7 +59,9 @@ class McDropoutNetwork(IntervalNetwork):
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As ``IntervalNetwork``."""
-        return interval_of_spread(self.passes(features))
+        points = self.passes(features)
+        mean = points.mean(dim=1)
+        return gaussian_interval(mean, (points - mean[:, None]).square().mean(dim=1).sqrt())
 
     def passes(self, features: Tensor) -> Tensor:
         """Features (n, size) -> points under each mask, (n, 30, 6)."""

@@ -115,6 +115,10 @@ class ExportedHead(nn.Module):
     def candidates(self) -> tuple[Candidate, ...]:
         """Return what val chooses among; the first stands unless another is clearly better."""
 
+    def choices(self) -> Mapping[str, float]:
+        """What val chose inside of this head, for the provenance; by default nothing."""
+        return {}
+
     def completed(self, content: bytes) -> bytes:
         """Add to an exported model what torch cannot export; by default nothing."""
         return content
@@ -190,6 +194,11 @@ class Method:
     config: type[Struct]
     train: Callable[[Lessons, Any], ExportedHead]
     restore: Callable[[Setting, Any, Mapping[str, Tensor]], ExportedHead]
+
+
+def interval_candidates(parameters: Struct) -> tuple[Candidate, ...]:
+    """Normalised before additive: factors carry over to harder or easier recordings."""
+    return (Candidate("normalised", parameters), Candidate("additive", parameters))
 
 
 def half_width_floor(target: Target) -> Six:

@@ -30,6 +30,7 @@ from cvo_export.heads.base import (
     conformalised_score,
     dense,
     half_width_floor,
+    interval_candidates,
 )
 from cvo_export.losses import (
     CombinedCalibrationLoss,
@@ -232,10 +233,7 @@ class CjpHead(ExportedHead):
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Normalised before additive: factors carry over to harder or easier recordings."""
-        return (
-            Candidate("normalised", self._method_parameters),
-            Candidate("additive", self._method_parameters),
-        )
+        return interval_candidates(self._method_parameters)
 
 
 def _train(lessons: Lessons, config: CjpConfig) -> CjpHead:

@@ -40,11 +40,14 @@ from cvo_export.heads.base import (
     Method,
     Setting,
     half_width_floor,
+    interval_candidates,
 )
 from cvo_export.heads.point import (
     PointNetwork,
     Residuals,
+    check_components,
     compressed,
+    deviation_of,
     learn_held_out,
     principal_components,
     residuals_of,
@@ -52,8 +55,6 @@ from cvo_export.heads.point import (
 from cvo_export.target import PoseDecoder
 
 Array = NDArray[np.float64]
-
-_LEAST_SCALE = 1e-6
 
 
 class CqrConfig(Struct, frozen=True, tag="cqr", tag_field="method", forbid_unknown_fields=True):
@@ -138,10 +139,7 @@ class CqrHead(ExportedHead):
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Normalised before additive: factors carry over to harder or easier recordings."""
-        return (
-            Candidate("normalised", self._method_parameters),
-            Candidate("additive", self._method_parameters),
-        )
+        return interval_candidates(self._method_parameters)
 
     def completed(self, content: bytes) -> bytes:
         """Put the forests behind ``forest_input`` and the bounds in its place.
@@ -202,6 +200,7 @@ _ORIGIN = np.array([1, 1, 1, 0, 0, 0], dtype=np.float32)
 
 
 def _train(lessons: Lessons, config: CqrConfig) -> CqrHead:
+    check_components(lessons, config.components)
     setting = lessons.setting
     held_out = learn_held_out(lessons, "cqr", config.residuals, config.hidden, config.feature_noise)
     network, rows = held_out.network, held_out.rows
@@ -216,8 +215,7 @@ def _train(lessons: Lessons, config: CqrConfig) -> CqrHead:
     x = np.concatenate(
         [compressed(network, features[:, rows], components), point.astype(np.float32)], axis=2
     )
-    centred = np.abs(residual - np.median(residual, axis=0))
-    scale = np.maximum(1.4826 * np.median(centred, axis=0), _LEAST_SCALE)
+    scale = deviation_of(residual)
     columns = (
         [slice(0, DOF)] if config.forest == "shared" else [slice(d, d + 1) for d in range(DOF)]
     )

@@ -42,11 +42,14 @@ from cvo_export.heads.base import (
     Setting,
     Standardise,
     half_width_floor,
+    interval_candidates,
 )
 from cvo_export.heads.point import (
     PointNetwork,
     Residuals,
+    check_components,
     compressed,
+    deviation_of,
     learn_held_out,
     principal_components,
     residuals_of,
@@ -60,8 +63,7 @@ _USUAL_KAPPA = 0.8
 _FEW_DRAWS = 100
 # Training rows that show which points of the codebook are of use.
 _USAGE_ROWS = 4000
-_LEAST_SCALE = 1e-6
-_DROPOUT = 0.05
+_DROPOUT, _PASSES = 0.05, 20
 
 
 class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unknown_fields=True):
@@ -76,7 +78,7 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
         ``predictions`` each pass is a point of its own, with its own condition and residual; with
         ``labels`` the condition stays that of the deterministic point; ``none``: no passes.
     passes
-        Stochastic passes of each frame.
+        Stochastic passes of each frame; None: 20.
     dropout
         Behind the point network's last hidden layer; None: 0.05 where there are passes, else 0.
     components
@@ -101,13 +103,13 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
     """
 
     augmentation: Literal["none", "predictions", "labels"] = "none"
-    passes: Annotated[int, Meta(ge=1, le=1000)] = 20
+    passes: Annotated[int, Meta(ge=1, le=1000)] | None = None
     dropout: Annotated[float, Meta(ge=0, lt=1)] | None = None
     components: Annotated[int, Meta(ge=0, le=4096)] = 16
     scale: Literal["local", "constant"] = "local"
     kappa: Annotated[float, Meta(gt=0)] | None = None
     directions: Annotated[int, Meta(ge=8, le=4096)] = 128
-    rays: Annotated[int, Meta(ge=1, le=256)] = 128
+    rays: Annotated[int, Meta(ge=1, le=192)] = 128
     tau: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05
     kl_weight: Annotated[float, Meta(ge=0)] = 0.01
     condition_noise: Annotated[float, Meta(ge=0)] = 0.05
@@ -116,7 +118,12 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
     feature_noise: float = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse passes that are all the same."""
+        """Refuse passes that are all the same, and their number where there are none."""
+        if self.augmentation == "none" and self.passes is not None:
+            raise ValueError(
+                f"passes: expected with the augmentation predictions or labels, found "
+                f"{self.passes} with none"
+            )
         if self.augmentation != "none" and self.dropout == 0.0:
             raise ValueError(
                 f"dropout: expected more than 0 for the passes of {self.augmentation}, found 0"
@@ -199,6 +206,7 @@ class McqrHead(ExportedHead):
         self.components: Tensor
         self.unit: Tensor
         self.kappa: Tensor
+        self.points: Tensor
         self.origin: Tensor
         self._method_parameters = McqrParameters(
             points=len(self.region.shells), half_width_floor=half_width_floor(setting.target)
@@ -216,14 +224,16 @@ class McqrHead(ExportedHead):
         return self.decoder.pose(coordinates), codebook, scale
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """Normalised before additive, as for CQR: of the six intervals alone."""
-        return (
-            Candidate("normalised", self._method_parameters),
-            Candidate("additive", self._method_parameters),
-        )
+        """As for CQR; of the six intervals alone."""
+        return interval_candidates(self._method_parameters)
+
+    def choices(self) -> Mapping[str, float]:
+        """Inflation of the region, and how many points of its codebook stayed."""
+        return {"kappa": float(self.kappa), "points": len(self.points)}
 
 
 def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
+    check_components(lessons, config.components)
     setting, passes = lessons.setting, config.augmentation != "none"
     held_out = learn_held_out(
         lessons,
@@ -240,15 +250,12 @@ def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
     known = point = held_out.points(features)
     poses = poses[:, rows]
     if passes:
-        point = held_out.passes(features, config.passes, setting.seed)
-        poses = np.tile(poses, (config.passes, 1, 1))
-        small = np.tile(small, (config.passes, 1, 1))
-        known = point
-        if config.augmentation == "labels":
-            known = np.tile(held_out.points(features), (config.passes, 1, 1))
+        count = config.passes or _PASSES
+        point = held_out.passes(features, count, setting.seed)
+        poses, small = np.tile(poses, (count, 1, 1)), np.tile(small, (count, 1, 1))
+        known = point if config.augmentation == "predictions" else np.tile(known, (count, 1, 1))
     residual = residuals_of(setting, point, poses)
-    centred = np.abs(residual - np.median(residual, axis=(0, 1)))
-    unit = np.maximum(1.4826 * np.median(centred, axis=(0, 1)), _LEAST_SCALE)
+    unit = deviation_of(residual)
     val_features, val_poses = lessons.val()
     with torch.no_grad():
         val_point = network(val_features)

@@ -29,6 +29,7 @@ Residuals = Literal["auto", "cross_fitted", "held_out"]
 # Fewer training frames than this are too few to set a part aside for models of residuals.
 _MANY_FRAMES = 1500
 _FOLDS = 3
+_LEAST_DEVIATION = 1e-6
 
 
 class PointNetwork(nn.Module):
@@ -177,6 +178,26 @@ def residuals_of(setting: Setting, point: Array, poses: Array) -> Array:
     origin = chart.coordinates(predicted, predicted)
     residual = chart.coordinates(poses.reshape(-1, 7), predicted) - origin
     return np.asarray(residual).reshape(*point.shape)
+
+
+def check_components(lessons: Lessons, count: int) -> None:
+    """Raise UsageError where there are not so many principal components; before any lesson."""
+    most = min(lessons.n_images, lessons.setting.feature_size)
+    if count > most:
+        raise UsageError(
+            f"components: expected at most {most}, the lesser of training frames and features, "
+            f"found {count}"
+        )
+
+
+def deviation_of(residual: Array) -> Array:
+    """Residuals (..., 6) -> 1.4826 times the median distance from the median: a Gaussian's sigma.
+
+    Shape (6,), at least 1e-6.
+    """
+    flat = residual.reshape(-1, DOF)
+    spread = np.median(np.abs(flat - np.median(flat, axis=0)), axis=0)
+    return np.asarray(np.maximum(1.4826 * spread, _LEAST_DEVIATION))
 
 
 def principal_components(
