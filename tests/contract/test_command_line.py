@@ -63,6 +63,22 @@ def test_summary_has_coverage_where_there_is_ground_truth(bundle_dir, clip_dir, 
     assert f"of {frames} frames" in result.stderr
 
 
+def test_the_region_is_recorded_on_request_and_only_where_there_is_one(bundle_dir, clip_dir):
+    regions = bundle_dir.with_name("synthetic-room-mcqr")
+    joint = ("--scope", "joint", "--region", "--quiet")
+    result = cvo_edge("run", regions, clip_dir, "--max-frames", 2, *joint)
+    assert result.returncode == 0
+    for line in result.stdout.splitlines():
+        interval = json.loads(line)["interval"]
+        assert interval["region"].keys() == {"radius", "scale", "centres"}
+        assert len(interval["region"]["centres"]) > 1
+    unbounded = cvo_edge("run", regions, clip_dir, *joint, "--max-frames", 1, "--confidence", 0.99)
+    assert json.loads(unbounded.stdout)["interval"]["region"] is None
+    assert "expected a bundle of mcqr" in refused(cvo_edge("run", regions, clip_dir, "--region"), 2)
+    refused(cvo_edge("run", bundle_dir, clip_dir, *joint), 2)
+    assert "jsonl" in refused(cvo_edge("run", regions, clip_dir, *joint, "--format", "csv"), 2)
+
+
 def test_quiet_is_quiet(bundle_dir, clip_dir):
     result = cvo_edge("run", bundle_dir, clip_dir, "--max-frames", 1, "--quiet")
     assert (result.returncode, result.stderr) == (0, "")

@@ -130,7 +130,7 @@ def test_pose_round_trips_through_its_matrix(t, v):
     )
 
 
-@pytest.mark.parametrize("bad", [[0] * 7, [np.nan, 0, 0, 0, 0, 0, 1], [0, 0, 0, 1]])
+@pytest.mark.parametrize("bad", [[0] * 7, [np.nan, 0, 0, 0, 0, 0, 1], [0, 0, 0, 1], "abc"])
 def test_what_is_no_pose_is_refused(bad):
     with pytest.raises(UsageError, match="expected 7 finite numbers"):
         Pose.from_array(bad)

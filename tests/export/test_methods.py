@@ -15,6 +15,7 @@ from cvo_edge.errors import GateError, UsageError
 from cvo_edge.session import Session
 from cvo_edge.sinks import Sink
 from cvo_export import publish as publishing
+from cvo_export import train as training
 from cvo_export.calibrate import observe
 from cvo_export.configure import configure
 from cvo_export.evaluate import evaluate, find_level, table
@@ -201,6 +202,7 @@ def test_an_option_of_another_method_is_refused():
         ("csp", {"classes": 1}, "classes"),
         ("mcqr", {"augmentation": "labels", "dropout": 0.0}, "dropout: expected more than 0"),
         ("mcqr", {"kappa": 0.0}, "kappa"),
+        ("mcqr", {"passes": 5}, "passes: expected with the augmentation"),
         ("nothing", {}, "expected one of cjp, cqr, csp"),
     ],
 )
@@ -341,13 +343,19 @@ def test_contains_is_the_region_in_the_joint_scope_and_six_intervals_in_the_marg
         assert level["joint_coverage"] == pytest.approx(np.mean(held))
 
 
-def test_the_volume_is_that_of_the_region_and_less_than_its_hull(runs):
+def test_the_volume_is_the_share_of_the_hull_that_lies_in_the_region(runs):
     _, run, bundle = runs("mcqr")
-    report = evaluate(bundle, run.dataset, "test")
-    level = find_level(report["levels"], 0.9, "joint")
-    deviation = np.array(read_calibration(bundle).pose.standard_deviation)
-    hull = np.prod(np.array(level["mean_width"]) / deviation)
-    assert 0.0 < level["joint_volume"]["mean"] < hull
+    generator = np.random.default_rng(0)
+    shares = []
+    with Odometer.load(bundle, scope="joint") as odometer:
+        deviation = np.array(odometer.calibration.pose.standard_deviation)
+        for index in run.split.roles["test"].tolist():
+            region = odometer.step(run.dataset.read_image(index)).region
+            points = generator.uniform(region.lower, region.upper, (400, 6))
+            held = np.mean([region.ellipsoids.contains(point) for point in points])
+            shares.append(held * np.prod((region.upper - region.lower) / deviation))
+    level = find_level(evaluate(bundle, run.dataset, "test")["levels"], 0.9, "joint")
+    assert level["joint_volume"]["mean"] == pytest.approx(np.mean(shares), rel=0.1)
 
 
 def test_records_have_the_region_on_request_only(runs, tmp_path):
@@ -370,11 +378,34 @@ def test_records_have_the_region_on_request_only(runs, tmp_path):
         assert not odometer.has_region
 
 
-def test_passes_are_extra_training_data_and_never_count_as_frames(runs):
-    _, run, bundle = runs("mcqr")
-    calibration = read_calibration(bundle)
+def test_passes_are_rows_of_the_region_and_real_frames_are_what_is_counted(tmp_path, monkeypatch):
+    seen = {}
+    learn = training._Trainer.learn
+
+    def spy(self, name, build, rows=None, examples=None):
+        if examples is not None:
+            seen[name] = examples.x.shape, examples.val_x.shape
+        return learn(self, name, build, rows, examples)
+
+    monkeypatch.setattr(training._Trainer, "learn", spy)
+    head = McqrConfig(components=4, rays=8, augmentation="predictions", passes=3)
+    run = train(tmp_path / "run", tiny_config(head=head, steps=100, copies=1), ignore_progress)
+    frames = run.split.roles["train"].size + run.split.roles["fit"].size
+    # Three passes of each of two copies; val has none.
+    assert seen == {"mcqr-region": ((3 * 2, frames, 10), (run.split.roles["val"].size, 10))}
+    calibration = publish(run, tmp_path / "bundle", "passes")
     assert calibration.calibration.n == run.split.roles["cal"].size
-    assert run.graph.head.point.dropout == 0.05
+    chosen = calibration.provenance.options
+    assert chosen["chosen.kappa"] == pytest.approx(float(run.graph.head.kappa))
+    assert chosen["chosen.points"] == calibration.method_parameters["points"]
+
+
+@pytest.mark.parametrize("method", ["cqr", "mcqr"])
+def test_more_components_than_there_are_is_refused_before_any_lesson(tmp_path, method):
+    config = tiny_config(head=type(CONFIGS[method])(components=4000))
+    with pytest.raises(UsageError, match="components: expected at most"):
+        train(tmp_path / "run", config, ignore_progress)
+    assert not list((tmp_path / "run").glob("checkpoint*"))
 
 
 def test_the_mean_of_many_passes_is_the_network_itself():

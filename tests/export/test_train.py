@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from cvo_edge.errors import UsageError
+from cvo_export import train as training
+from cvo_export.features import ModelImages
 from cvo_export.run import load_run
 from cvo_export.target import MAX_SPREAD_RAD, fit_target
 from cvo_export.train import train
@@ -101,3 +103,25 @@ def test_a_degree_of_freedom_that_never_moves_is_refused():
     poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (10, 1))
     with pytest.raises(UsageError, match="motion in every degree of freedom"):
         fit_target(poses)
+
+
+def test_too_few_frames_of_val_to_decide_anything_are_refused(tmp_path):
+    config = tiny_config(dataset="synthetic:room,flights=8,frames=10,size=64x48")
+    with pytest.raises(UsageError, match="at least 9 frames of the role val"):
+        train(tmp_path / "run", config, ignore_progress)
+    assert not (tmp_path / "run").exists()
+
+
+def test_features_of_other_pixels_are_not_shared(tiny_run, tmp_path):
+    images = ModelImages(tiny_run.dataset, np.arange(20), 48, 64, "none")
+    before = training._shared_folder(tmp_path, tiny_run.config, "w", images)
+    assert training._shared_folder(tmp_path, tiny_run.config, "w", images) == before
+    images.images[3, 2, 1] ^= 1
+    assert training._shared_folder(tmp_path, tiny_run.config, "w", images) != before
+
+
+def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "checkpoint-cjp.pt").write_bytes(b"no checkpoint")
+    with pytest.raises(UsageError, match="expected a checkpoint of this version"):
+        train(tmp_path / "run", tiny_config(), ignore_progress)
