@@ -106,7 +106,7 @@ class RegionNetwork(nn.Module):
         directions, rays = fibonacci_sphere(config.directions), fibonacci_sphere(config.rays)
         self.register_buffer("directions", directions)
         self.directions: Tensor
-        slope = directions @ rays.T
+        slope = rays @ directions.T
         leaving = torch.where(slope < -_PARALLEL, -1.0 / slope.clamp(max=-_PARALLEL), 1e9)
         self.register_buffer("leaving", leaving)
         self.leaving: Tensor
@@ -182,8 +182,8 @@ class RegionNetwork(nn.Module):
 
     def _reach(self, c: Tensor) -> Tensor:
         """Condition (n, c) -> where each ray from the centre leaves the region, (n, rays)."""
-        distance = softplus(self.distance(c))[:, :, None] * self.leaving
-        reach: Tensor = distance.amin(dim=1).clamp(min=_LEAST_RADIUS)
+        distance = softplus(self.distance(c))[:, None] * self.leaving
+        reach: Tensor = distance.amin(dim=2).clamp(min=_LEAST_RADIUS)
         return reach
 
     def _decoded(self, z: Tensor, c: Tensor) -> Tensor:
