@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 RESULTS = Path(__file__).parent / "results"
-METHODS = ("cjp", "cqr", "csp")
+METHODS = ("cjp", "cqr", "csp", "mcqr")
 HEADER = (
     "| recording, split | method | median error | score | coverage at 0.9, per DoF "
     "| joint scope: all six | median width |\n|---|---|---|---|---|---|---|"
