@@ -1,7 +1,7 @@
 """Methods and baselines beside each other: trained, calibrated, evaluated and timed; one table.
 
 A cell is a method with a seed. A finished one is a file and never run again; an interrupted one
-goes on from its own checkpoints. Cells run beside each other in processes of one thread each; what
+goes on from its own checkpoints. Cells run beside each other, torch with one thread in each; what
 a frame costs is measured afterwards, alone.
 """
 

@@ -1,4 +1,4 @@
-"""Tasks beside each other, each in a process of its own with one thread."""
+"""Tasks beside each other, each in a process of its own with one thread of torch."""
 
 from __future__ import annotations
 
