@@ -143,7 +143,9 @@ def _draw_dof(
     axes.bar(places, heights, 1.0, bottoms, color=_BAND, alpha=0.6, linewidth=0, label="set")
     axes.plot(rows, scale * point, color=_POINT, linewidth=0.9, label="point")
     axes.plot(rows, shown, color=_TRUTH, linewidth=0.9, label="truth")
-    axes.plot(missed, scale * truth[missed, dof], "x", color=_MISSED, markersize=5, label="missed")
+    regions = any(estimates[row].region.ellipsoids for row in rows)
+    label = "outside of the region of all six" if regions else "missed"
+    axes.plot(missed, scale * truth[missed, dof], "x", color=_MISSED, markersize=5, label=label)
     axes.set_ylim(shown.min() - 0.4 * spread, shown.max() + 0.4 * spread)
     kind = " about the prediction" if dof > 2 and chart.rotation == "tangent_predicted" else ""
     axes.set_ylabel(f"{chart.dof[dof]} ({unit}){kind}")

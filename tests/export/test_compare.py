@@ -134,7 +134,7 @@ def test_the_report_holds_every_figure_and_no_path(compared, options):
     assert set(report["timing"]["ms"]) == set(METHODS)
     assert report["options"]["steps"] == 100
     assert report["heads"]["gaussian"]["method"] == "gaussian"
-    assert report["environment"]["cores_allowed"] >= 1
+    assert report["timing"]["environment"]["cores_allowed"] >= 1
     assert options["weights"] not in text
     assert str(out.parent) not in text
 
