@@ -261,6 +261,9 @@ def train(
     kl_weight: Annotated[
         float | None, typer.Option(min=0, help="beta of the divergence; cjp: 0.001, mcqr: 0.01.")
     ] = None,
+    members: Annotated[
+        int | None, typer.Option(min=1, max=64, help="cjp: networks whose answers are averaged, 1.")
+    ] = None,
     quantiles: Annotated[
         tuple[float, float] | None,
         typer.Option(help="cqr: levels of the bounds before conformalising, 0.05 0.95."),
@@ -356,6 +359,7 @@ def train(
             "gate": gate,
             "interval_form": interval_form,
             "kl_weight": kl_weight,
+            "members": members,
             "quantiles": quantiles,
             "trees": trees,
             "leaf_size": leaf_size,

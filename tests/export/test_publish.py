@@ -7,6 +7,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
+import torch
 
 from cvo_edge import Odometer, SinkError, SourceError
 from cvo_edge.artifact import CONFIDENCES, read_bundle, read_calibration
@@ -15,7 +16,7 @@ from cvo_edge.errors import GateError
 from cvo_edge.selftest import check_selftest
 from cvo_edge.session import Session
 from cvo_export.calibrate import observe
-from cvo_export.heads.cjp import CjpConfig
+from cvo_export.heads.cjp import CjpConfig, CjpLearner, CjpNetwork, CjpPrediction
 from cvo_export.publish import publish
 from cvo_export.to_onnx import check_parity
 from cvo_export.train import train
@@ -105,6 +106,50 @@ def test_codebook_latent_needs_the_image_alone(tmp_path):
     publish(run, tmp_path / "bundle", "codebook")
     with Odometer.load(tmp_path / "bundle") as odometer:
         assert [spec.name for spec in odometer.session.inputs] == ["image"]
+
+
+@pytest.mark.parametrize("latent", ["mean", "codebook"])
+def test_several_members_answer_with_their_mean(latent):
+    torch.manual_seed(0)
+    config = CjpConfig(latent_size=4, hidden=(16, 8), members=3, latent=latent)
+    network = CjpNetwork(20, config).eval()
+    features = torch.randn(5, 20)
+    each = []
+    for member in network.members:
+        alone = CjpNetwork(20, msgspec.structs.replace(config, members=1)).eval()
+        alone.members[0] = member
+        each.append(alone(features))
+    assert not torch.allclose(each[0][0], each[1][0])
+    for found, values in zip(network(features), zip(*each, strict=True), strict=True):
+        torch.testing.assert_close(found, torch.stack(values).mean(dim=0))
+
+
+def test_members_learn_beside_each_other_as_if_alone():
+    torch.manual_seed(0)
+    config = CjpConfig(latent_size=4, hidden=(16, 8), members=2)
+    learner = CjpLearner(20, config).train()
+    features, y = torch.randn(8, 20), torch.randn(8, 6)
+    first, second = learner.network.members
+    second.load_state_dict(first.state_dict())
+    learner.loss(features, y, warm_up=True).backward()
+    slopes = [member.encoder[0].weight.grad for member in (first, second)]
+    # The same weights and rows, but each has noise of its own.
+    assert all(slope.abs().sum() > 0 for slope in slopes)
+    assert not torch.allclose(*slopes)
+    prediction = learner.network.samples(features)
+    loss = learner.of_prediction(prediction, y.repeat(2, 1), warm_up=True)
+    halves = [
+        learner.of_prediction(CjpPrediction(*(v[rows] for v in prediction)), y, warm_up=True)
+        for rows in (slice(8), slice(8, None))
+    ]
+    torch.testing.assert_close(loss, torch.stack(halves).mean())
+
+
+def test_a_run_of_several_members_becomes_a_bundle(tmp_path):
+    head = CjpConfig(members=2)
+    run = train(tmp_path / "run", tiny_config(steps=100, head=head), ignore_progress)
+    publish(run, tmp_path / "bundle", "two")
+    assert read_bundle(tmp_path / "bundle").calibration.provenance.options["head.members"] == 2
 
 
 def test_a_damaged_image_costs_that_frame_only(tiny_bundle, tiny_run):

@@ -7,7 +7,7 @@ point m and bounds Q_l, Q_h of all six degrees of freedom, trained with one loss
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -79,6 +79,8 @@ class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unkno
         Standard deviation of Gaussian noise on the standardised features while training.
     dropout
         Dropout behind the encoder's and decoder's layers while training.
+    members
+        Networks that began differently, trained beside each other; point and bounds are their mean.
     """
 
     latent_size: Annotated[int, Meta(ge=1, le=4096)] = 16
@@ -92,6 +94,7 @@ class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unkno
     kl_weight: Annotated[float, Meta(ge=0)] = 1e-3
     feature_noise: float = 0.1
     dropout: float = 0.0
+    members: Annotated[int, Meta(ge=1, le=64)] = 1
 
 
 class CjpPrediction(NamedTuple):
@@ -104,14 +107,13 @@ class CjpPrediction(NamedTuple):
     log_variance: Tensor
 
 
-class CjpNetwork(nn.Module):
-    """Features (n, size) -> CjpPrediction in standardised units."""
+class CjpMember(nn.Module):
+    """One variational network: standardised features (n, size) -> CjpPrediction."""
 
     def __init__(self, size: int, config: CjpConfig) -> None:
         super().__init__()
-        self.config = config
+        self.free = config.bounds == "free"
         wide, narrow = config.hidden
-        self.standardise = Standardise(size, config.feature_noise)
         self.encoder = nn.Sequential(
             *dense(size, wide, config.dropout), *dense(wide, narrow, config.dropout)
         )
@@ -123,24 +125,78 @@ class CjpNetwork(nn.Module):
             nn.Linear(wide, 3 * DOF),
         )
 
-    def encode(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def encode(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Features (n, size) -> mean and log variance of the latent, (n, latent_size) each."""
-        hidden = self.encoder(self.standardise(features))
+        hidden = self.encoder(x)
         # Beyond +-10 a variance is zero or infinite in float32; early steps do go there.
         return self.mu(hidden), self.log_variance(hidden).clamp(-10.0, 10.0)
 
     def decode(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Latent (n, latent_size) -> point, lower, upper (n, 6), standardised."""
         point, a, b = self.decoder(z).split(DOF, dim=1)
-        if self.config.bounds == "free":
+        if self.free:
             return point, torch.minimum(a, b), torch.maximum(a, b)
         return point, point - softplus(a), point + softplus(b)
 
-    def forward(self, features: Tensor, noise: Tensor | None = None) -> CjpPrediction:
+    def forward(self, x: Tensor, noise: Tensor | None = None) -> CjpPrediction:
         """Features (n, size), latent noise (n, latent_size) or None for the latent's mean."""
-        mu, log_variance = self.encode(features)
+        mu, log_variance = self.encode(x)
         z = mu if noise is None else mu + noise * torch.exp(0.5 * log_variance)
         return CjpPrediction(*self.decode(z), mu, log_variance)
+
+
+class CjpNetwork(nn.Module):
+    """Features (n, size) -> point, lower, upper (n, 6), standardised: the mean of the members'."""
+
+    def __init__(self, size: int, config: CjpConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.standardise = Standardise(size, config.feature_noise)
+        self.members = nn.ModuleList(CjpMember(size, config) for _ in range(config.members))
+        self.register_buffer("codebook", _codebook(config.latent_size))
+        self.codebook: Tensor
+
+    def forward(
+        self, features: Tensor, noise: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Features (n, size), as inference draws the latent.
+
+        noise (n, latent_size) in ``sample`` mode only, the same for all members.
+        """
+        x = self.standardise(features)
+        found = [self._drawn(cast("CjpMember", member), x, noise) for member in self.members]
+        if len(found) == 1:
+            return found[0]
+        point, lower, upper = (
+            torch.stack(values).mean(dim=0) for values in zip(*found, strict=True)
+        )
+        return point, lower, upper
+
+    def samples(self, features: Tensor) -> CjpPrediction:
+        """Features (n, size) -> each member's (members * n, ...), one after the other.
+
+        For training: the latent is sampled, and each member draws noise of its own.
+        """
+        found = []
+        for member in self.members:
+            noise = torch.randn(len(features), self.config.latent_size)
+            found.append(member(self.standardise(features), noise))
+        return CjpPrediction(*(torch.cat(values) for values in zip(*found, strict=True)))
+
+    def _drawn(
+        self, member: CjpMember, x: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        if self.config.latent != "codebook":
+            point, lower, upper, _, _ = member(x, noise)
+            return point, lower, upper
+        mu, log_variance = member.encode(x)
+        spread = torch.exp(0.5 * log_variance)
+        z = mu[:, None, :] + self.codebook * spread[:, None, :]
+        decoded = member.decode(z.flatten(0, 1))
+        point, lower, upper = (
+            values.reshape(-1, _CODEBOOK_SIZE, DOF).mean(dim=1) for values in decoded
+        )
+        return point, lower, upper
 
 
 class CjpLearner(Learner):
@@ -155,9 +211,8 @@ class CjpLearner(Learner):
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
         """Features (n, size), truth (n, 6) -> scalar; in warm-up without the calibration term."""
-        noise = torch.randn(len(y), self.config.latent_size)
-        prediction = self.network(features, noise)
-        return self.of_prediction(prediction, y, warm_up)
+        prediction = self.network.samples(features)
+        return self.of_prediction(prediction, y.repeat(self.config.members, 1), warm_up)
 
     def of_prediction(self, prediction: CjpPrediction, y: Tensor, warm_up: bool) -> Tensor:
         """Prediction and truth (n, 6) -> scalar."""
@@ -174,34 +229,8 @@ class CjpLearner(Learner):
 
     def val_score(self, features: Tensor, y: Array) -> float:
         """As ``Learner``; of the network's own bounds with the additive score."""
-        _, lower, upper = CjpDecoded(self.network)(features)
+        _, lower, upper = self.network(features)
         return conformalised_score(lower.double().numpy(), upper.double().numpy(), y)
-
-
-class CjpDecoded(nn.Module):
-    """Features -> point, lower, upper (n, 6), standardised, as inference draws the latent."""
-
-    def __init__(self, network: CjpNetwork) -> None:
-        super().__init__()
-        self.network = network
-        self.register_buffer("codebook", _codebook(network.config.latent_size))
-        self.codebook: Tensor
-
-    def forward(
-        self, features: Tensor, noise: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Features (n, size); noise (n, latent_size) in ``sample`` mode only."""
-        if self.network.config.latent != "codebook":
-            point, lower, upper, _, _ = self.network(features, noise)
-            return point, lower, upper
-        mu, log_variance = self.network.encode(features)
-        spread = torch.exp(0.5 * log_variance)
-        z = mu[:, None, :] + self.codebook * spread[:, None, :]
-        decoded = self.network.decode(z.flatten(0, 1))
-        point, lower, upper = (
-            values.reshape(-1, _CODEBOOK_SIZE, DOF).mean(dim=1) for values in decoded
-        )
-        return point, lower, upper
 
 
 class CjpHead(ExportedHead):
@@ -212,7 +241,7 @@ class CjpHead(ExportedHead):
 
     def __init__(self, network: CjpNetwork, setting: Setting) -> None:
         super().__init__()
-        self.decoded = CjpDecoded(network)
+        self.network = network
         self.decoder = PoseDecoder(setting.target)
         config = network.config
         if config.latent == "sample":
@@ -228,7 +257,7 @@ class CjpHead(ExportedHead):
         self, features: Tensor, noise: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return pose, lower and upper in metres and radians."""
-        point, lower, upper = (self.decoder(values) for values in self.decoded(features, noise))
+        point, lower, upper = (self.decoder(values) for values in self.network(features, noise))
         return self.decoder.pose(point), lower, upper
 
     def candidates(self) -> tuple[Candidate, ...]:
