@@ -16,62 +16,76 @@ import numpy as np
 RESULTS = Path(__file__).parent / "results" / "compare"
 OURS = ("cjp", "cqr", "csp", "mcqr")
 HEADER = (
-    "| | score, own bounds | score, calibrated | coverage per DoF | joint scope: coverage, volume "
-    "| median error | training | head | a frame |\n|---|---|---|---|---|---|---|---|---|"
+    "| | score, own bounds | score, calibrated | coverage per DoF | joint scope: coverage "
+    "| its volume^(1/6) | median error | training | head | a frame |\n" + "|---" * 10 + "|"
 )
 
 Cell = dict[str, Any]
+# One of each recording.
+Reports = list[dict[str, Any]]
 
 
-def median(cells: list[Cell], figure: Callable[[Cell], float | None]) -> float | None:
-    """Return the median over the seeds that have this figure, None where none has."""
-    found = [value for value in map(figure, cells) if value is not None]
-    return float(np.median(found)) if found else None
+def main() -> None:
+    """Print one table of the recordings named on the command line, a figure of each in a cell."""
+    reports = [json.loads((RESULTS / f"{name}.json").read_text("utf-8")) for name in sys.argv[1:]]
+    methods = {cell["method"] for report in reports for cell in report["cells"]}
+    print(", ".join(f"{report['dataset']} ({report['options']['split']})" for report in reports))
+    print(HEADER)
+    # The sum of logarithms: recordings of any difficulty count alike.
+    for method in sorted(methods, key=lambda name: np.log(scores(reports, name)).sum()):
+        print(row(reports, method))
 
 
-def shown(value: float | None, form: str) -> str:
-    """Return a figure, or a dash."""
-    return "-" if value is None else form.format(value)
+def row(reports: Reports, method: str) -> str:
+    """Return a method's line; scores within 2 % of the recording's best are bold."""
+    best = np.min([scores(reports, name) for name in reports[0]["heads"]], axis=0)
+    marked = [
+        f"**{score:.3f}**" if score <= 1.02 * least else f"{score:.3f}"
+        for score, least in zip(scores(reports, method), best, strict=True)
+    ]
+    head = cells(reports[0], method)[0]["head_parameters"]
 
+    def each(form: str, *figures: Callable[[Cell], float | None]) -> str:
+        medians = ([median(report, method, f) for f in figures] for report in reports)
+        return ", ".join("-" if None in row else form.format(*row) for row in medians)
 
-def row(method: str, cells: list[Cell], ms: dict[str, float], best: float) -> str:
-    """Return a method's line; the best score and those within 2 % of it are bold."""
-    score = median(cells, lambda cell: cell["marginal"]["normalised_interval_score"]) or 0.0
-    mark = "**" if score <= 1.02 * best else ""
-    volume = median(cells, lambda cell: cell["joint_volume"]["geometric_mean"]) or 0.0
     parts = [
         f"**{method}**" if method in OURS else method,
-        shown(
-            median(cells, lambda c: c["own"] and c["own"]["normalised_interval_score"]), "{:.3f}"
+        each("{:.3f}", lambda c: c["own"] and c["own"]["normalised_interval_score"]),
+        ", ".join(marked),
+        each("{:.3f}", lambda c: c["marginal"]["mean_coverage"]),
+        each("{:.3f}", lambda c: c["joint"]["joint_coverage"]),
+        each("{:.3f}", lambda c: c["joint_volume"]["geometric_mean"] ** (1 / 6)),
+        each(
+            "{:.2f} cm {:.2f} deg",
+            lambda c: 100 * c["point_error"]["median_m"],
+            lambda c: c["point_error"]["median_deg"],
         ),
-        f"{mark}{score:.3f}{mark}",
-        shown(median(cells, lambda cell: cell["marginal"]["mean_coverage"]), "{:.3f}"),
-        shown(median(cells, lambda cell: cell["joint"]["joint_coverage"]), "{:.3f}")
-        + f", {volume ** (1 / 6):.3f}",
-        shown(median(cells, lambda cell: 100 * cell["point_error"]["median_m"]), "{:.2f} cm ")
-        + shown(median(cells, lambda cell: cell["point_error"]["median_deg"]), "{:.2f} deg"),
-        shown(median(cells, lambda c: c["training"] and c["training"]["processor"]), "{:.0f} s"),
-        f"{cells[0]['head_parameters'] / 1e6:.2f} M",
-        f"{ms['p50']:.2f} ms",
+        each("{:.0f} s", lambda c: c["training"] and c["training"]["processor"]),
+        f"{head / 1e6:.2f} M",
+        ", ".join(f"{report['timing']['ms'][method]['p50']:.2f} ms" for report in reports),
     ]
     return "| " + " | ".join(parts) + " |"
 
 
-def main() -> None:
-    """Print a table for each recording named on the command line."""
-    for recording in sys.argv[1:]:
-        report = json.loads((RESULTS / f"{recording}.json").read_text("utf-8"))
-        by_method: dict[str, list[Cell]] = {}
-        for cell in report["cells"]:
-            by_method.setdefault(cell["method"], []).append(cell)
-        scores = {
-            method: median(cells, lambda cell: cell["marginal"]["normalised_interval_score"]) or 0.0
-            for method, cells in by_method.items()
-        }
-        print(f"\n{report['dataset']}, {report['options']['split']} split\n\n{HEADER}")
-        for method in sorted(by_method, key=lambda name: scores[name]):
-            ms = report["timing"]["ms"][method]
-            print(row(method, by_method[method], ms, min(scores.values())))
+def scores(reports: Reports, method: str) -> list[float]:
+    """Return the calibrated interval score of each recording."""
+    found = [
+        median(report, method, lambda c: c["marginal"]["normalised_interval_score"])
+        for report in reports
+    ]
+    return [value for value in found if value is not None]
+
+
+def median(report: dict[str, Any], method: str, figure: Callable[[Cell], Any]) -> float | None:
+    """Return the median over the seeds that have this figure, None where none has."""
+    found = [value for value in map(figure, cells(report, method)) if value is not None]
+    return float(np.median(found)) if found else None
+
+
+def cells(report: dict[str, Any], method: str) -> list[Cell]:
+    """Return the cells of a method, one a seed."""
+    return [cell for cell in report["cells"] if cell["method"] == method]
 
 
 if __name__ == "__main__":

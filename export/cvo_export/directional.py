@@ -19,7 +19,9 @@ is a region; decoded, it may be a ring, a banana or two pieces. What is ours:
   it: all points of a latent grid that lie inside;
 - where that makes val's regions smaller, points that are the nearest to hardly any training
   response are left out: they stand where the ball in latent space covers a gap, such as the middle
-  of a ring.
+  of a ring;
+- where responses are no such shape a codebook is worth nothing beside B(c): ``thrifty_choice``
+  leaves as few points as it can.
 """
 
 from __future__ import annotations
@@ -52,6 +54,8 @@ _PARALLEL = 1e-3
 _LEAST_RADIUS = 1e-3
 # A point of the codebook that is the nearest to less than this, of its even share, is left out.
 _LEAST_SHARE = 0.1
+# Volume to the power 1/d that a smaller codebook may cost.
+_HARDLY = 1.02
 _TAIL = 5.0
 # Responses this many scales out say no more of the shape.
 _FAR = 20.0
@@ -116,6 +120,8 @@ class RegionNetwork(nn.Module):
         ray = torch.arange(config.rays)
         self.register_buffer("ray", torch.cat([ray[:1], *(ray for _ in SHELLS)]))
         self.ray: Tensor
+        # Then no ray is needed.
+        self.centre_alone = False
 
     def scale(self, c: Tensor) -> Tensor:
         """Condition (n, c) -> B (n, d, d), lower triangular with a positive diagonal."""
@@ -136,13 +142,16 @@ class RegionNetwork(nn.Module):
 
     def codebook(self, c: Tensor, kappa: Tensor) -> Tensor:
         """Condition (n, c), kappa () -> points of the region in R^d before B, (n, J, d)."""
-        radius = kappa * self._reach(c)
-        z = self.centre(c)[:, None] + radius[:, self.ray, None] * self.shells
+        z = self.centre(c)[:, None]
+        if not self.centre_alone:
+            radius = kappa * self._reach(c)
+            z = z + radius[:, self.ray, None] * self.shells
         return self._decoded(z, c)
 
     def keep(self, points: Tensor) -> None:
         """Leave out all other points of the codebook; indices in ascending order."""
         self.shells, self.ray = self.shells[points], self.ray[points]
+        self.centre_alone = points.tolist() == [0]
 
     def grid_codebook(self, c: Tensor, side: int = 16) -> tuple[Tensor, Tensor]:
         """All points of a latent grid, decoded, (n, side^3, d), and which are inside, (n, side^3).
@@ -216,6 +225,30 @@ def best_choice(
         for points in (everything, _used(network, *train, kappa))
     ]
     return min(choices, key=lambda choice: mean_volume(network, *val, choice))
+
+
+def thrifty_choice(
+    network: RegionNetwork,
+    train: tuple[Tensor, Array],
+    val: tuple[Tensor, Array],
+    kappas: Sequence[float] = KAPPAS,
+) -> Choice:
+    """Return the smallest codebook whose regions on val are hardly larger than the best choice's.
+
+    A codebook costs a decoder's work for every point. Tried are the centre alone, one ellipsoid,
+    and the centre with the outermost shell. Arguments as for ``best_choice``.
+    """
+    best = best_choice(network, train, val, kappas)
+    limit = _HARDLY * mean_volume(network, *val, best)
+    rays = network.config.rays
+    outermost = np.concatenate([[0], np.arange(len(network.shells) - rays, len(network.shells))])
+    choices = [Choice(best.kappa, outermost[:1]), *(Choice(kappa, outermost) for kappa in kappas)]
+    volumes = [mean_volume(network, *val, choice) for choice in choices]
+    if volumes[0] <= limit:
+        return choices[0]
+    if min(volumes[1:]) <= limit and len(outermost) < len(best.points):
+        return choices[1 + int(np.argmin(volumes[1:]))]
+    return best
 
 
 @torch.no_grad()

@@ -14,6 +14,7 @@ from cvo_export.directional import (
     fibonacci_sphere,
     mean_volume,
     scaled_distances,
+    thrifty_choice,
 )
 from cvo_export.losses import pinball_loss
 
@@ -172,3 +173,32 @@ def test_points_that_no_response_is_near_are_left_out():
     everything = Choice(chosen.kappa, np.arange(385))
     assert 0 < len(chosen.points) < 385
     assert mean_volume(network, c, y, chosen) < mean_volume(network, c, y, everything)
+
+
+def test_a_codebook_stays_only_where_the_shape_needs_one():
+    def leaning(count, generator):
+        x = generator.uniform(0.0, 1.0, (count, 1))
+        y = (0.2 + x) * generator.standard_normal((count, 2))
+        return x, y @ np.array([[1.0, 0.8], [0.0, 0.3]])
+
+    kept = {}
+    for make in (leaning, two_pieces):
+        network = fitted(make)
+        x, y = make(1500, np.random.default_rng(5))
+        c = torch.tensor(x).float()
+        arguments = (network, (c, y), (c[:400], y[:400]))
+        thrifty, best = thrifty_choice(*arguments), best_choice(*arguments)
+        kept[make] = thrifty.points
+        assert len(thrifty.points) <= len(best.points)
+        volume, least = (mean_volume(network, c[:400], y[:400], z) for z in (thrifty, best))
+        assert volume <= 1.02 * least
+    # A Gaussian is an ellipse, two pieces are none.
+    assert kept[leaning].tolist() == [0]
+    assert len(kept[two_pieces]) > 1
+
+
+def test_the_centre_alone_is_the_same_point_without_its_rays(network, condition):
+    everything = network.codebook(condition, torch.tensor(1.5))
+    network.keep(torch.tensor([0]))
+    assert network.centre_alone
+    torch.testing.assert_close(network.codebook(condition, torch.tensor(1.5)), everything[:, :1])

@@ -29,8 +29,8 @@ from cvo_export.directional import (
     Choice,
     RegionConfig,
     RegionNetwork,
-    best_choice,
     mean_volume,
+    thrifty_choice,
 )
 from cvo_export.heads.base import (
     DOF,
@@ -291,7 +291,8 @@ def _choice(learner: RegionLearner, examples: Examples, config: McqrConfig, seed
         c = learner.standardise(torch.from_numpy(examples.x[copy, row]).float())
         val_c = learner.standardise(examples.val_x)
     kappas = KAPPAS if config.kappa is None else (config.kappa,)
-    return best_choice(learner.network, (c, examples.y[copy, row]), (val_c, examples.val_y), kappas)
+    train, val = (c, examples.y[copy, row]), (val_c, examples.val_y)
+    return thrifty_choice(learner.network, train, val, kappas)
 
 
 def _restore(setting: Setting, config: McqrConfig, state: Mapping[str, Tensor]) -> McqrHead:
