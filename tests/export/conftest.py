@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from cvo_export.augment import AugmentConfig
 from cvo_export.backbone import BackboneConfig
@@ -13,6 +14,9 @@ from cvo_export.heads.cjp import CjpConfig
 from cvo_export.publish import publish
 from cvo_export.run import Run, TrainConfig
 from cvo_export.train import train
+
+# Networks this small wait for threads longer than they compute.
+torch.set_num_threads(1)
 
 DATASET = "synthetic:room,flights=8,frames=40,size=64x48"
 

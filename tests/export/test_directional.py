@@ -128,7 +128,7 @@ def test_a_region_of_two_pieces_covers_them_and_little_of_the_gap():
     with torch.no_grad():
         x, y = two_pieces(500, generator)
         c = torch.tensor(x).float()
-        choice = best_choice(network, (c, y), (c, y))
+        choice = best_choice(network, (c, y), (c[:150], y[:150]), (0.6, 1.0))
         network.keep(torch.from_numpy(choice.points))
         codebook, scale = network.codebook(c, torch.tensor(choice.kappa)), network.scale(c)
     assert codebook.shape == (500, len(choice.points), 2)
@@ -169,10 +169,12 @@ def test_points_that_no_response_is_near_are_left_out():
     network = fitted(two_pieces)
     x, y = two_pieces(2000, np.random.default_rng(4))
     c = torch.tensor(x).float()
-    chosen = best_choice(network, (c, y), (c[:300], y[:300]))
+    chosen = best_choice(network, (c, y), (c[:150], y[:150]), (0.6, 1.0))
     everything = Choice(chosen.kappa, np.arange(385))
     assert 0 < len(chosen.points) < 385
-    assert mean_volume(network, c, y, chosen) < mean_volume(network, c, y, everything)
+    rows = slice(150, 450)
+    left, all_of_it = (mean_volume(network, c[rows], y[rows], z) for z in (chosen, everything))
+    assert left < all_of_it
 
 
 def test_a_codebook_stays_only_where_the_shape_needs_one():
@@ -186,11 +188,11 @@ def test_a_codebook_stays_only_where_the_shape_needs_one():
         network = fitted(make)
         x, y = make(1500, np.random.default_rng(5))
         c = torch.tensor(x).float()
-        arguments = (network, (c, y), (c[:400], y[:400]))
+        arguments = (network, (c[:500], y[:500]), (c[:150], y[:150]), (0.6, 1.0))
         thrifty, best = thrifty_choice(*arguments), best_choice(*arguments)
         kept[make] = thrifty.points
         assert len(thrifty.points) <= len(best.points)
-        volume, least = (mean_volume(network, c[:400], y[:400], z) for z in (thrifty, best))
+        volume, least = (mean_volume(network, c[:150], y[:150], z) for z in (thrifty, best))
         assert volume <= 1.02 * least
     # A Gaussian is an ellipse, two pieces are none.
     assert kept[leaning].tolist() == [0]
