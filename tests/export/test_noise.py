@@ -1,12 +1,18 @@
 """Noise: what each kind does to pixels, and what it does to coverage."""
 
+import json
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from cvo_edge.errors import UsageError
+from cvo_edge.errors import SourceError, UsageError
+from cvo_export.cli import app
 from cvo_export.datasets import open_dataset
+from cvo_export.evaluate import evaluate, find_level, table
 from cvo_export.noise import KINDS, Noise, noisy, parse_noise
+from cvo_export.recalibrate import recalibrate
 from cvo_export.splits import make_split, same_split
 
 from .conftest import DATASET
@@ -233,3 +239,122 @@ def test_another_text_is_refused_in_one_line(text, message):
     with pytest.raises(UsageError) as caught:
         parse_noise(text)
     assert str(caught.value) == message
+
+
+# -- evaluation -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def report(tiny_bundle, tiny_run):
+    return evaluate(tiny_bundle, tiny_run.dataset, "test", noise=parse_noise("speckle:0.6"))
+
+
+@pytest.fixture(scope="module")
+def clean_report(tiny_bundle, tiny_run):
+    return evaluate(tiny_bundle, tiny_run.dataset, "test")
+
+
+@pytest.mark.parametrize("scope", ["marginal", "joint"])
+def test_noise_breaks_coverage_and_recalibration_mends_it_by_wider_sets(
+    report, clean_report, scope
+):
+    clean = find_level(report["levels"], 0.9, scope)
+    mended = find_level(report["recalibrated"]["levels"], 0.9, scope)
+    low, high = mended["coverage_band"]
+    assert mended["coverage_band_exact"]
+    holds = "joint_coverage" if scope == "joint" else "coverage"
+    assert (np.array(clean[holds]) < low).all()
+    assert (low <= np.array(mended[holds])).all()
+    assert (np.array(mended[holds]) <= high).all()
+    assert (np.array(mended["mean_width"]) > 1.2 * np.array(clean["mean_width"])).all()
+    assert clean_report["noise"] is None
+    assert "recalibrated" not in clean_report
+
+
+def test_clean_thresholds_claim_no_band_under_noise(report):
+    assert not any(level["coverage_band_exact"] for level in report["levels"])
+    for key in ("coverage_band", "coverage_band_effective"):
+        assert [level[key] for level in report["levels"]] == [None] * 10
+        assert any(level[key] for level in report["recalibrated"]["levels"])
+
+
+def test_the_report_says_which_noise_and_its_table_has_both_policies(report):
+    assert report["noise"] == {"name": "speckle", "strength": 0.6, "seed": 0}
+    assert report["recalibrated"]["n_calibration"] + report["recalibrated"]["invalid"] == 64
+    json.dumps(report, allow_nan=False)
+    lines = table(report)
+    assert "noise speckle:0.6 (deviation, share of the pixel's own level), seed 0" in lines
+    clean = lines.index("clean: the bundle's own thresholds, of 64 frames without noise")
+    again = lines.index(
+        "recalibrated: thresholds of 64 calibration frames with the same noise; invalid 0"
+    )
+    for part, footnotes in ((lines[clean:again], 1), (lines[again:], 0)):
+        assert sum("marginal" in line for line in part) == 5
+        assert sum(line.startswith("flight-") for line in part) == 8
+        assert sum(line.startswith("- no band: ") for line in part) == footnotes
+
+
+def test_without_any_strength_both_policies_are_the_clean_evaluation(
+    clean_report, tiny_bundle, tiny_run
+):
+    """Recalibration on the same pixels finds the same thresholds to the last bit."""
+    found = evaluate(tiny_bundle, tiny_run.dataset, "test", noise=Noise("gaussian", 0.0))
+    assert found["recalibrated"]["levels"] == clean_report["levels"]
+    assert found["sequences"] == clean_report["sequences"]
+    assert found["point_error"] == clean_report["point_error"]
+    for key in ("coverage", "joint_coverage", "mean_width", "interval_score"):
+        assert [level[key] for level in found["levels"]] == [
+            level[key] for level in clean_report["levels"]
+        ]
+
+
+def test_frames_that_a_check_flags_are_counted_in_both_roles(tiny_bundle, tiny_run):
+    """An image that cannot be read stays so under noise."""
+    broken = {int(tiny_run.split.roles[role][0]) for role in ("cal", "test")}
+    dataset = open_dataset(DATASET)
+    read_image = dataset.read_image
+
+    def read(index):
+        if index in broken:
+            raise SourceError("damaged")
+        return read_image(index)
+
+    found = evaluate(
+        tiny_bundle, replace(dataset, read_image=read), "test", noise=parse_noise("occlusion")
+    )
+    assert found["frames"]["invalid"] == 1
+    assert found["recalibrated"]["invalid"] == 1
+    assert found["recalibrated"]["n_calibration"] == 63
+
+
+def test_a_split_by_sequence_is_indicative_after_recalibration(tiny_bundle, tmp_path):
+    other = open_dataset("synthetic:room,flights=12,frames=10,size=64x48,seed=4")
+    calibration = recalibrate(
+        *(tiny_bundle, other, tmp_path / "b", "b"), kind="sequence", rule="pooled", new_data=True
+    )
+    found = evaluate(tmp_path / "b", other, "test", noise=parse_noise("exposure"))
+    level = find_level(found["recalibrated"]["levels"], 0.9, "marginal")
+    assert level["coverage_band"] is not None
+    assert not level["coverage_band_exact"]
+    assert "other_rule" not in found
+    assert found["recalibrated"]["n_calibration"] == calibration.calibration.n
+    indicative = "? indicative: frames of one recording are no independent draws"
+    assert table(found).count(indicative) == 1
+
+
+def test_the_command_line_takes_a_noise_and_refuses_it_on_unseen_data(
+    tiny_bundle, clean_report, capsys
+):
+    arguments = ["evaluate", str(tiny_bundle), DATASET, "--noise", "salt-and-pepper:0.2"]
+    app([*arguments, "--json", "-"], standalone_mode=False)
+    found = json.loads(capsys.readouterr().out)
+    assert found["noise"] == {"name": "salt-and-pepper", "strength": 0.2, "seed": 0}
+    assert found["point_error"]["median_m"] > clean_report["point_error"]["median_m"]
+    with pytest.raises(UsageError) as caught:
+        app([*arguments, "--subset", "all"], standalone_mode=False)
+    assert str(caught.value) == (
+        "noise: expected --subset test, as unseen data have no calibration frames to be "
+        "recalibrated on, found all"
+    )
+    with pytest.raises(UsageError, match="NAME one of gaussian"):
+        app([*arguments[:-1], "fog"], standalone_mode=False)
