@@ -496,7 +496,7 @@ def evaluate(
         str | None,
         typer.Option(
             metavar="NAME[:STRENGTH]",
-            help="Degrade the test frames, e.g. speckle:0.3: clean and recalibrated thresholds.",
+            help="Degrade the frames, e.g. speckle:0.3; thresholds as they are, and recalibrated.",
         ),
     ] = None,
     json_file: Annotated[
@@ -510,8 +510,9 @@ def evaluate(
 ) -> None:
     """Coverage, width and error of a bundle on held-out frames.
 
-    With noise, of the bundle's own thresholds and of those of the run's calibration frames with the
-    same noise. NAME is gaussian, salt-and-pepper, speckle, motion-blur, exposure or occlusion.
+    With --noise of degraded test frames: at the bundle's own thresholds, and at those of the run's
+    calibration frames degraded alike. NAME is gaussian, salt-and-pepper, speckle, motion-blur,
+    exposure or occlusion.
     """
     from cvo_export.datasets import open_dataset
     from cvo_export.evaluate import check_coverage, table

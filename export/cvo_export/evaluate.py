@@ -73,7 +73,7 @@ def evaluate(
     SourceError
         The data set is not the one that was split, or no frame passes the checks.
     UsageError
-        Noise on ``all``.
+        Noise on ``all``, or a calibration rule that is not computed here.
     """
     bundle = read_bundle(bundle_dir)
     calibration = bundle.calibration
