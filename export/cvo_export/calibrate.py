@@ -165,13 +165,23 @@ def calibrated(
             for name, values in observe_selftest(odometer).outputs.items()
         }
     scored = with_candidate(draft, chosen(draft, val, candidates))
-    head = HEADS[scored.method](scored)
+    scored = replace(scored, selftest=replace(scored.selftest, outputs=selftest))
+    return with_thresholds(scored, val, cal)
+
+
+def with_thresholds(calibration: Calibration, val: Observed, cal: Observed) -> Calibration:
+    """Return the calibration with the thresholds of these observations, and their counts.
+
+    Rule, joint scope and score are its own; val compares degrees of freedom for the joint scope.
+
+    Raises UsageError for a rule that is not computed here.
+    """
+    head = HEADS[calibration.method](calibration)
     cal_scores = cal.scored(head)
-    source = scored.calibration
+    source, rule = calibration.calibration, rule_of(calibration)
     return replace(
-        scored,
-        thresholds=thresholds(head, cal_scores, val.scored(head), rule_of(scored), source.joint),
-        selftest=replace(scored.selftest, outputs=selftest),
+        calibration,
+        thresholds=thresholds(head, cal_scores, val.scored(head), rule, source.joint),
         calibration=replace(
             source,
             n=len(cal.indices),

@@ -492,6 +492,13 @@ def evaluate(
     subset: Annotated[
         SubsetName, typer.Option(help="The run's test frames, or all of unseen data.")
     ] = SubsetName.TEST,
+    noise: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME[:STRENGTH]",
+            help="Degrade the frames, e.g. speckle:0.3; thresholds as they are, and recalibrated.",
+        ),
+    ] = None,
     json_file: Annotated[
         str | None, typer.Option("--json", help="Write the report as JSON to a file or -.")
     ] = None,
@@ -501,12 +508,19 @@ def evaluate(
     ] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of one inference.")] = None,
 ) -> None:
-    """Coverage, width and error of a bundle on held-out frames."""
+    """Coverage, width and error of a bundle on held-out frames.
+
+    With --noise of degraded test frames: at the bundle's own thresholds, and at those of the run's
+    calibration frames degraded alike. NAME is gaussian, salt-and-pepper, speckle, motion-blur,
+    exposure or occlusion.
+    """
     from cvo_export.datasets import open_dataset
     from cvo_export.evaluate import check_coverage, table
     from cvo_export.evaluate import evaluate as evaluate_bundle
+    from cvo_export.noise import parse_noise
 
-    report = evaluate_bundle(bundle, open_dataset(dataset), subset.value, threads)
+    parsed = None if noise is None else parse_noise(noise)
+    report = evaluate_bundle(bundle, open_dataset(dataset), subset.value, threads, parsed)
     if json_file is not None:
         write_text(json_file, json.dumps(report, indent=1) + "\n")
     if json_file != "-":

@@ -3,69 +3,106 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.stats import betabinom
 
 from cvo_edge import geometry
 from cvo_edge.artifact import Calibration, Threshold, read_bundle
 from cvo_edge.conformal import conformal_rank, interval_score
-from cvo_edge.errors import GateError
+from cvo_edge.errors import GateError, UsageError
 from cvo_edge.heads.cqr import CqrHead, IntervalScore
 from cvo_edge.heads.csp import CspHead
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import ConformalSet
-from cvo_export.calibrate import Observed, Rule, effective_frames, observe, thresholds, workspace
+from cvo_export.calibrate import (
+    Observed,
+    Rule,
+    effective_frames,
+    observe,
+    with_thresholds,
+    workspace,
+)
 from cvo_export.datasets import PoseDataset
+from cvo_export.noise import Noise, noisy
 from cvo_export.splits import Split, same_split
 from cvo_export.volume import ellipsoids_log_volume
 
 Array = NDArray[np.float64]
 Subset = Literal["test", "all"]
+# Of coverage: a band that holds, one that would if frames were independent draws, or none.
+Claim = Literal["exact", "indicative", "none"]
 
 # The band that a valid method's coverage stays in with this probability.
 _BAND_PROBABILITY = 0.99
+
+# What the table says of the claims that are not exact.
+_INDICATIVE = "? indicative: frames of one recording are no independent draws"
+_NO_CLAIM = "- no band: thresholds of clean frames promise nothing of noisy ones"
 
 _LEAST_WIDTH = 1e-3
 _LARGEST_LOG = 700.0
 
 
 def evaluate(
-    bundle_dir: Path, dataset: PoseDataset, subset: Subset, threads: int | None = None
+    bundle_dir: Path,
+    dataset: PoseDataset,
+    subset: Subset,
+    threads: int | None = None,
+    noise: Noise | None = None,
 ) -> dict[str, Any]:
     """Evaluate every stored confidence and scope; the report of ``cvo-export evaluate --json``.
 
     ``test``: the frames that the run recorded as test, found again by the split in the bundle;
     ``all``: every frame of a data set that the run has not seen. Frames that a check flags are left
-    out and counted. Where the run was split by sequence the other calibration rule is evaluated
-    beside the bundle's own.
+    out and counted.
 
-    Raises SourceError where the data set is not the one that was split.
+    With ``noise``, drawn by the split's seed, all frames are degraded. The bundle's own thresholds,
+    of clean frames, are evaluated beside those of the run's cal frames with the same noise
+    (``recalibrated``). Without, where the run was split by sequence, the other calibration rule is
+    evaluated beside the bundle's own.
+
+    Raises
+    ------
+    SourceError
+        The data set is not the one that was split, or no frame passes the checks.
+    UsageError
+        Noise on ``all``, or a calibration rule that is not computed here.
     """
     bundle = read_bundle(bundle_dir)
     calibration = bundle.calibration
     recorded = calibration.calibration.split
     first = calibration.thresholds[0]
     split = same_split(dataset, recorded) if subset == "test" else None
+    if noise is not None:
+        if split is None:
+            raise UsageError(
+                "noise: expected --subset test, as unseen data have no calibration frames to be "
+                f"recalibrated on, found {subset}"
+            )
+        dataset = noisy(dataset, noise, recorded.seed)
     indices = subset_indices(calibration, dataset, subset)
+    claim: Claim = "exact" if split is not None and split.kind == "random" else "indicative"
     with Odometer(
         bundle, threads=threads, confidence=first.confidence, scope=first.scope
     ) as odometer:
         seen = observe(odometer, dataset, indices)
-        exact = split is not None and split.kind == "random"
-        sets = _Sets(odometer, seen, exact, calibration.calibration.rule)
-        levels = [sets.level(entry) for entry in calibration.thresholds]
+        # Clean frames and noisy ones are not exchangeable.
+        sets = _Sets(odometer, seen, calibration, claim if noise is None else "none")
+        levels = sets.levels()
         report = {
             "bundle": calibration.name,
             "method": calibration.method,
             "dataset": dataset.name,
             "subset": subset,
             "split": recorded.kind,
+            "noise": None if noise is None else {**asdict(noise), "seed": recorded.seed},
             "rule": calibration.calibration.rule,
             "score": calibration.calibration.score,
             "frames": {
@@ -82,16 +119,19 @@ def evaluate(
             "levels": levels,
             "sequences": sets.sequences(dataset),
         }
-        if split is not None and split.kind == "sequence":
-            rule: Rule = (
-                "pooled" if calibration.calibration.rule == "hierarchical" else "hierarchical"
-            )
-            entries = _recalibrated(odometer, dataset, split, rule)
-            others = _Sets(odometer, seen, exact, rule)
-            report["other_rule"] = {
-                "rule": rule,
-                "levels": [others.level(entry) for entry in entries],
+        if split is not None and noise is not None:
+            again = _recalibrated(odometer, dataset, split, calibration)
+            others = _Sets(odometer, seen, again, claim)
+            report["recalibrated"] = {
+                "n_calibration": again.calibration.n,
+                "invalid": split.roles["cal"].size - again.calibration.n,
+                "levels": others.levels(),
+                "sequences": others.sequences(dataset),
             }
+        elif split is not None and split.kind == "sequence":
+            other = _recalibrated(odometer, dataset, split, _by_the_other_rule(calibration))
+            others = _Sets(odometer, seen, other, claim)
+            report["other_rule"] = {"rule": other.calibration.rule, "levels": others.levels()}
     return report
 
 
@@ -152,7 +192,10 @@ def coverage_band(n_calibration: int, n_test: int, confidence: float) -> list[fl
 
 
 def check_coverage(report: Mapping[str, Any], least: float) -> None:
-    """Raise GateError where a DoF's marginal coverage at 0.9 is below ``least``."""
+    """Raise GateError where a DoF's marginal coverage at 0.9 is below ``least``.
+
+    That of the bundle's own thresholds, also under noise.
+    """
     level = find_level(report["levels"], 0.9, "marginal")
     worst = min(level["coverage"])
     if not worst >= least:
@@ -177,6 +220,9 @@ def table(report: Mapping[str, Any]) -> list[str]:
         f"point error  median {100 * error['median_m']:.2f} cm {error['median_deg']:.2f} deg, "
         f"90 % {100 * error['p90_m']:.2f} cm {error['p90_deg']:.2f} deg",
     ]
+    if report["noise"] is not None:
+        noise = Noise(report["noise"]["name"], report["noise"]["strength"])
+        lines.append(f"noise {noise} ({noise.unit}), seed {report['noise']['seed']}")
     if report["subset"] == "all" and report["named_as_training_data"]:
         lines.append("the name is that of the training data: true only if no frame is of it")
     if report["own"] is not None:
@@ -186,17 +232,25 @@ def table(report: Mapping[str, Any]) -> list[str]:
             f"own bounds for 0.9, not calibrated: coverage {coverage}, all six "
             f"{own['joint_coverage']:.3f}, score {own['normalised_interval_score']:.3f}"
         )
-    lines += _level_lines(report["rule"], report["levels"])
-    if "other_rule" in report:
-        lines += _level_lines(report["other_rule"]["rule"], report["other_rule"]["levels"])
-    if len(report["sequences"]) > 1:
-        lines += ["", f"{'sequence':<14}{'frames':>8}{'coverage at 0.9 per DoF':>44}{'joint':>10}"]
-        for name, entry in report["sequences"].items():
-            cells = "".join(f"{value:>8.2f}" for value in entry["coverage"])
-            lines.append(
-                f"{name:<14}{entry['frames']:>8}{cells:>48}{entry['joint_coverage']:>10.2f}"
-            )
-    return lines
+    if report["noise"] is None:
+        lines += ["", *_level_lines(report["rule"], report["levels"])]
+        if "other_rule" in report:
+            other = report["other_rule"]
+            lines += ["", *_level_lines(other["rule"], other["levels"])]
+        return lines + _sequence_lines(report["sequences"])
+    again = report["recalibrated"]
+    return [
+        *lines,
+        "",
+        f"clean: the bundle's own thresholds, of {report['n_calibration']} frames without noise",
+        *_level_lines(report["rule"], report["levels"], _NO_CLAIM),
+        *_sequence_lines(report["sequences"]),
+        "",
+        f"recalibrated: thresholds of {again['n_calibration']} calibration frames with the same "
+        f"noise; invalid {again['invalid']}",
+        *_level_lines(report["rule"], again["levels"]),
+        *_sequence_lines(again["sequences"]),
+    ]
 
 
 def _bounded(levels: list[dict[str, Any]], frames: int) -> int:
@@ -205,9 +259,8 @@ def _bounded(levels: list[dict[str, Any]], frames: int) -> int:
     return round((1.0 - float(lowest["unbounded_share"])) * frames)
 
 
-def _level_lines(rule: str, levels: list[dict[str, Any]]) -> list[str]:
+def _level_lines(rule: str, levels: list[dict[str, Any]], footnote: str = _INDICATIVE) -> list[str]:
     lines = [
-        "",
         f"{rule + ' rule':<20}{'coverage: tx ty tz, three rotations':^42}{'joint':>7}"
         f"{'99 % band':>16}{'width cm':>10}{'deg':>7}{'score':>8}",
     ]
@@ -237,33 +290,45 @@ def _level_lines(rule: str, levels: list[dict[str, Any]]) -> list[str]:
         if level["confidence"] == 0.9 and "joint_volume" in level
     ]
     if not all(level["coverage_band_exact"] for level in levels):
-        lines.append("? indicative: frames of one recording are no independent draws")
+        lines.append(footnote)
+    return lines
+
+
+def _sequence_lines(sequences: Mapping[str, Any]) -> list[str]:
+    if len(sequences) < 2:
+        return []
+    lines = ["", f"{'sequence':<14}{'frames':>8}{'coverage at 0.9 per DoF':>44}{'joint':>10}"]
+    for name, entry in sequences.items():
+        cells = "".join(f"{value:>8.2f}" for value in entry["coverage"])
+        lines.append(f"{name:<14}{entry['frames']:>8}{cells:>48}{entry['joint_coverage']:>10.2f}")
     return lines
 
 
 def _recalibrated(
-    odometer: Odometer, dataset: PoseDataset, split: Split, rule: Rule
-) -> tuple[Threshold, ...]:
-    cal, val = (
-        observe(odometer, dataset, split.roles[role]).scored(odometer.head)
-        for role in ("cal", "val")
-    )
-    joint = odometer.calibration.calibration.joint
-    return thresholds(odometer.head, cal, val, rule, joint)
+    odometer: Odometer, dataset: PoseDataset, split: Split, draft: Calibration
+) -> Calibration:
+    """Return the draft with thresholds of the run's cal frames, as this data set shows them."""
+    val, cal = (observe(odometer, dataset, split.roles[role]) for role in ("val", "cal"))
+    return with_thresholds(draft, val, cal)
+
+
+def _by_the_other_rule(calibration: Calibration) -> Calibration:
+    source = calibration.calibration
+    rule: Rule = "pooled" if source.rule == "hierarchical" else "hierarchical"
+    return replace(calibration, calibration=replace(source, rule=rule))
 
 
 @dataclass(frozen=True)
 class _Sets:
-    """The sets of all observed frames at any threshold."""
+    """The sets of all observed frames at the thresholds of a calibration, and what it claims.
+
+    The calibration is the odometer's own, or that with other thresholds.
+    """
 
     odometer: Odometer
     seen: Observed
-    exact: bool
-    rule: str
-
-    @property
-    def calibration(self) -> Calibration:
-        return self.odometer.calibration
+    calibration: Calibration
+    claim: Claim
 
     @cached_property
     def effective(self) -> float:
@@ -283,6 +348,10 @@ class _Sets:
         pairs = zip(regions, self.seen.truth, strict=True)
         return float(np.mean([region.contains(y) for region, y in pairs]))
 
+    def levels(self) -> list[dict[str, Any]]:
+        """Return the report's entries for all thresholds."""
+        return [self.level(entry) for entry in self.calibration.thresholds]
+
     def level(self, entry: Threshold) -> dict[str, Any]:
         """Return the report's entry for one threshold."""
         regions = self.seen.regions(self.odometer.head, entry)
@@ -297,8 +366,9 @@ class _Sets:
         alpha = (1.0 - entry.confidence) * (2.0 if one_bound else 1.0)
         # The band is that of one order statistic of frames: it says nothing of a rule that counts
         # sequences, of two thresholds a set, or of six that hold together by Bonferroni.
-        finite = (
-            self.rule == "pooled"
+        banded = (
+            self.claim != "none"
+            and self.calibration.calibration.rule == "pooled"
             and len(used) == 1
             and any(None not in side for side in (entry.q_hat, entry.q_hat_upper or (None,)))
             and (entry.scope, self.calibration.calibration.joint) != ("joint", "bonferroni")
@@ -308,15 +378,15 @@ class _Sets:
             "scope": entry.scope,
             "coverage": covered.mean(axis=0).tolist(),
             "coverage_bounded": covered[bounded].mean(axis=0).tolist() if bounded.any() else None,
-            "coverage_band": coverage_band(n, n_test, entry.confidence) if finite else None,
+            "coverage_band": coverage_band(n, n_test, entry.confidence) if banded else None,
             "coverage_band_effective": coverage_band(
                 max(1, int(self.calibration.calibration.n_effective)),
                 max(1, int(self.effective)),
                 entry.confidence,
             )
-            if finite
+            if banded
             else None,
-            "coverage_band_exact": self.exact,
+            "coverage_band_exact": self.claim == "exact",
             "joint_coverage": self.covered_jointly(regions),
             **self.widths(limited, alpha),
             "unbounded_share": float(1.0 - bounded.mean()),

@@ -17,6 +17,7 @@ from cvo_export.scene.renderer import Floats, Image, Pinhole
 Levels = NDArray[np.float32]
 
 _BLUR_DEPTH_M = 2.2  # the typical distance of what the camera sees
+_BLUR_SAMPLES = 16
 
 
 def motion_blur(
@@ -33,7 +34,7 @@ def motion_blur(
     intrinsics
         fx, fy, cx, cy in pixels.
     """
-    kernel = _streak(_image_shift(opening, pose, closing, intrinsics))
+    kernel = streak(_image_shift(opening, pose, closing, intrinsics), _BLUR_SAMPLES)
     blurred = cv2.filter2D(sharp, cv2.CV_32F, kernel, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(blurred, np.float32)
 
@@ -46,14 +47,18 @@ def _image_shift(opening: Floats, pose: Floats, closing: Floats, intrinsics: Pin
     return np.asarray(moved * intrinsics[:2])
 
 
-def _streak(shift: Floats) -> Levels:
-    """Return the kernel of a uniform motion by ``shift`` pixels, symmetric and of sum one."""
+def streak(shift: Floats, samples: int) -> Levels:
+    """Return the kernel of a uniform motion by ``shift`` pixels, symmetric and of sum one.
+
+    ``shift`` (2,) is right and down, in pixels; ``samples`` points of the path share its light, at
+    least one for each pixel, or the streak has gaps.
+    """
     radius = math.ceil(float(np.abs(shift).max()) / 2)
     kernel = np.zeros((2 * radius + 3, 2 * radius + 3), np.float32)
-    for x, y in np.linspace(-0.5, 0.5, 16)[:, None] * shift + radius + 1:
+    for x, y in np.linspace(-0.5, 0.5, samples)[:, None] * shift + radius + 1:
         column, row = int(x), int(y)
         weights = np.outer((1 - y + row, y - row), (1 - x + column, x - column))
-        kernel[row : row + 2, column : column + 2] += weights / 16
+        kernel[row : row + 2, column : column + 2] += weights / samples
     return kernel
 
 

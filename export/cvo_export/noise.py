@@ -1,0 +1,192 @@
+"""Images made worse on purpose, to see what intervals are worth when the camera sees less.
+
+Each noise has one strength and 0 changes nothing. It falls on the camera's own image, before the
+model's resize: as on a device, averaging pixels then takes part of what differs from pixel to
+pixel. The paper (section V) adds gaussian, salt-and-pepper and speckle noise and states no
+strength.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.errors import UsageError
+from cvo_export.datasets import PoseDataset
+from cvo_export.scene.sensor import streak
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One degradation of an image; its text is the one that ``parse_noise`` reads.
+
+    Raises UsageError for a name that is not in ``KINDS``, or a strength out of its range.
+
+    Attributes
+    ----------
+    name
+        A key of ``KINDS``.
+    strength
+        In the unit that ``KINDS`` gives.
+    """
+
+    name: str
+    strength: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is not in ``KINDS``."""
+        if self.name not in KINDS:
+            raise _unknown(self.name)
+        kind = KINDS[self.name]
+        # Written so that NaN is out of range.
+        if not kind.lowest <= self.strength <= kind.highest:
+            raise _out_of_range(self.name, f"{self.strength:g}")
+
+    def __str__(self) -> str:
+        return f"{self.name}:{self.strength}"
+
+    @property
+    def unit(self) -> str:
+        """What the strength is."""
+        return KINDS[self.name].unit
+
+    def degrade(self, image: Image, generator: np.random.Generator) -> Image:
+        """Image (height, width, 3) uint8 BGR -> a new one of the same shape and type."""
+        return KINDS[self.name].degrade(image, self.strength, generator)
+
+
+def parse_noise(text: str) -> Noise:
+    """Read ``NAME``, at its default strength, or ``NAME:STRENGTH``, e.g. ``speckle:0.3``.
+
+    Raises UsageError for any other text.
+    """
+    name, colon, digits = text.partition(":")
+    if name not in KINDS:
+        raise _unknown(text)
+    if not colon:
+        return Noise(name, KINDS[name].default)
+    try:
+        return Noise(name, float(digits))
+    except ValueError:
+        raise _out_of_range(name, repr(digits)) from None
+
+
+def noisy(dataset: PoseDataset, noise: Noise, seed: int) -> PoseDataset:
+    """Return the same frames with every image degraded, each by a generator of (seed, frame).
+
+    What is drawn depends on no order. Names and poses stay, and with them splits and roles; the
+    data set's name, too, as it tells whose frames these are.
+    """
+
+    def read_image(index: int) -> Image:
+        return noise.degrade(dataset.read_image(index), np.random.default_rng((seed, index)))
+
+    return replace(dataset, read_image=read_image)
+
+
+# -- kinds ----------------------------------------------------------------------------------------
+
+
+def _gaussian(image: Image, strength: float, generator: np.random.Generator) -> Image:
+    """Return I + 255 s n, n standard normal in every pixel and channel: noise of the sensor."""
+    noise = generator.standard_normal(image.shape, dtype=np.float32)
+    # Both sums and products are rounded and cut at 0 and 255 by OpenCV.
+    noisy = cv2.add(image, np.float32(255.0 * strength) * noise, dtype=cv2.CV_8U)
+    return np.asarray(noisy, dtype=np.uint8)
+
+
+def _salt_and_pepper(image: Image, strength: float, generator: np.random.Generator) -> Image:
+    """Turn each pixel white with probability s/2, black with s/2: hot and dead pixels."""
+    drawn = generator.random(image.shape[:2])
+    noisy = image.copy()
+    noisy[drawn < 0.5 * strength] = 0
+    noisy[drawn >= 1.0 - 0.5 * strength] = 255
+    return noisy
+
+
+def _speckle(image: Image, strength: float, generator: np.random.Generator) -> Image:
+    """Return I (1 + s n), n standard normal in every pixel and channel: bright places suffer."""
+    noise = generator.standard_normal(image.shape, dtype=np.float32)
+    noisy = cv2.multiply(image, 1.0 + np.float32(strength) * noise, dtype=cv2.CV_8U)
+    return np.asarray(noisy, dtype=np.uint8)
+
+
+def _motion_blur(image: Image, strength: float, generator: np.random.Generator) -> Image:
+    """Mean along a straight path of s image widths in a random direction, centred on the pixel.
+
+    Centred, so that the pose stays that of the middle of the exposure.
+    """
+    length = strength * image.shape[1]
+    angle = generator.uniform(0.0, math.pi)
+    shift = length * np.array([math.cos(angle), math.sin(angle)])
+    # Two samples a pixel: bilinear weights leave no ripple.
+    kernel = streak(shift, 2 * math.ceil(length) + 1)
+    blurred = cv2.filter2D(image, cv2.CV_8U, kernel, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred, dtype=np.uint8)
+
+
+def _exposure(image: Image, strength: float, _: np.random.Generator) -> Image:
+    """Change light by the factor 2^s, cut at white: s stops, negative is darker.
+
+    In linear light, as a shutter does it: coded values are decoded and coded by the curves of sRGB
+    (IEC 61966-2-1). What the camera had cut at white turns grey when it darkens. Nothing is drawn.
+    """
+    coded = np.arange(256) / 255.0
+    light = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+    light = np.minimum(light * 2.0**strength, 1.0)
+    coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    return np.asarray(cv2.LUT(image, np.rint(255.0 * coded).astype(np.uint8)), dtype=np.uint8)
+
+
+def _occlusion(image: Image, strength: float, generator: np.random.Generator) -> Image:
+    """Cover the share s by a rectangle of the image's shape: random place inside, random colour."""
+    height, width = (round(math.sqrt(strength) * side) for side in image.shape[:2])
+    top = generator.integers(image.shape[0] - height, endpoint=True)
+    left = generator.integers(image.shape[1] - width, endpoint=True)
+    covered = image.copy()
+    covered[top : top + height, left : left + width] = generator.integers(256, size=3)
+    return covered
+
+
+class Kind(NamedTuple):
+    """How an image is degraded; default and range of the strength, and what it is."""
+
+    degrade: Callable[[Image, float, np.random.Generator], Image]
+    default: float
+    lowest: float
+    highest: float
+    unit: str
+
+
+# The first three defaults are those of MATLAB's imnoise, which has these names: variances 0.01 and
+# 0.05 (a deviation of 0.22), density 0.05. The others are as easy to see in a picture of a room.
+KINDS: dict[str, Kind] = {
+    "gaussian": Kind(_gaussian, 0.1, 0.0, 1.0, "deviation, share of the full range"),
+    "salt-and-pepper": Kind(_salt_and_pepper, 0.05, 0.0, 1.0, "share of the pixels"),
+    "speckle": Kind(_speckle, 0.22, 0.0, 1.0, "deviation, share of the pixel's own level"),
+    "motion-blur": Kind(_motion_blur, 0.03, 0.0, 0.5, "length, share of the image's width"),
+    "exposure": Kind(_exposure, -2.0, -8.0, 8.0, "stops, negative is darker"),
+    "occlusion": Kind(_occlusion, 0.1, 0.0, 1.0, "share of the image's area"),
+}
+
+
+def _unknown(text: str) -> UsageError:
+    return UsageError(
+        f"noise: expected NAME or NAME:STRENGTH with NAME one of {', '.join(KINDS)}, found {text!r}"
+    )
+
+
+def _out_of_range(name: str, found: str) -> UsageError:
+    kind = KINDS[name]
+    return UsageError(
+        f"noise {name}: expected a strength of {kind.lowest:g} to {kind.highest:g} ({kind.unit}), "
+        f"found {found}"
+    )
