@@ -9,12 +9,14 @@ from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
 from cvo_export.datasets.seven_scenes import open_seven_scenes
 from cvo_export.datasets.synthetic import open_room
+from cvo_export.datasets.tum import open_tum
 
 __all__ = ["FORMATS", "Intrinsics", "PoseDataset", "open_dataset"]
 
 FORMATS: dict[str, Callable[[str], PoseDataset]] = {
     "7scenes": open_seven_scenes,
     "rgbd-scenes": open_rgbd_scenes,
+    "tum": open_tum,
     "synthetic": open_room,
 }
 
