@@ -97,7 +97,7 @@ def test_writing_a_sequence_gives_it_back(tmp_path):
 
 @pytest.mark.parametrize("text", ["room", "colmap:x", "", "synthetic", ":room"])
 def test_an_unknown_format_lists_those_there_are(text):
-    with pytest.raises(UsageError, match="7scenes, rgbd-scenes, tum, kitti, synthetic"):
+    with pytest.raises(UsageError, match="7scenes, rgbd-scenes, tum, kitti, euroc, synthetic"):
         open_dataset(text)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from cvo_edge.errors import UsageError
 from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.euroc import open_euroc
 from cvo_export.datasets.kitti import open_kitti
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
 from cvo_export.datasets.seven_scenes import open_seven_scenes
@@ -19,6 +20,7 @@ FORMATS: dict[str, Callable[[str], PoseDataset]] = {
     "rgbd-scenes": open_rgbd_scenes,
     "tum": open_tum,
     "kitti": open_kitti,
+    "euroc": open_euroc,
     "synthetic": open_room,
 }
 
