@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ Array = NDArray[np.float64]
 MATRIX_SUFFIX = ".pose.txt"
 
 # Frames are matched to the nearest ground-truth stamp within this bound, as the TUM tools do.
-_MAX_STAMP_DIFFERENCE_NS = 20_000_000
+MAX_STAMP_DIFFERENCE_NS = 20_000_000
 
 _MAX_BYTES = 256 << 20
 
@@ -25,21 +26,53 @@ _MAX_BYTES = 256 << 20
 def read_pose_matrix(path: Path) -> Array | None:
     """Read a 4x4 camera-to-world matrix in metres -> pose (7,), or None where it is no pose.
 
-    The rotation is made orthonormal (recorded ones are off by up to 4e-4); a matrix that is not
-    finite, whose rotation part is further than 0.01 from a rotation, or that is no text of 16
-    numbers, is no pose: tracking was lost there.
+    What is no text of 16 numbers, or no pose by ``matrix_to_pose``, is none: tracking was lost
+    there.
     """
     try:
         T = np.array(path.read_text("ascii").split(), dtype=np.float64)
     except (OSError, ValueError):
         return None
-    if T.size != 16 or not np.isfinite(T).all():
+    return matrix_to_pose(T.reshape(4, 4)) if T.size == 16 else None
+
+
+def matrix_to_pose(T: Array) -> Array | None:
+    """Shape (4, 4), a homogeneous matrix in metres -> pose (7,), or None where it is no pose.
+
+    The rotation is made orthonormal (recorded ones are off by up to 4e-4); a matrix that is not
+    finite, or whose rotation part is further than 0.01 from a rotation, is no pose.
+    """
+    if not np.isfinite(T).all():
         return None
-    T = T.reshape(4, 4)
     R = geometry.nearest_rotation(T[:3, :3])
     if np.abs(R - T[:3, :3]).max() > 0.01 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
         return None
     return np.concatenate([T[:3, 3], geometry.matrix_to_quaternion(R)])
+
+
+def seconds_to_ns(text: str) -> int:
+    """Seconds as a file writes them -> integer nanoseconds; raises ValueError where it is none."""
+    seconds, _, fraction = text.partition(".")
+    if seconds.isdecimal() and (fraction.isdecimal() or not fraction):
+        # A double holds present-day stamps to 200 ns only: count the digits instead.
+        return int(seconds) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
+    try:
+        return round(float(text) * 1e9)
+    except OverflowError:
+        raise ValueError(text) from None
+
+
+def nearest_stamp(stamps_ns: Sequence[int], stamp_ns: int, bound_ns: int) -> int | None:
+    """Index of the nearest of ascending stamps, the earlier of two; None where beyond the bound."""
+    right = bisect_left(stamps_ns, stamp_ns)
+    nearest = min(
+        range(max(0, right - 1), min(right + 1, len(stamps_ns))),
+        key=lambda index: abs(stamps_ns[index] - stamp_ns),
+        default=None,
+    )
+    if nearest is None or abs(stamps_ns[nearest] - stamp_ns) > bound_ns:
+        return None
+    return nearest
 
 
 class GroundTruth:
@@ -54,15 +87,10 @@ class GroundTruth:
         """Return the true ``T_world_camera`` (7,) of an estimate's frame, or None."""
         if self._by_name:
             return self._by_name.get(Path(estimate.source).stem.removesuffix(".color"))
-        if estimate.stamp_ns is None or not self._stamps_ns:
+        if estimate.stamp_ns is None:
             return None
-        right = bisect_left(self._stamps_ns, estimate.stamp_ns)
-        nearest = min(
-            range(max(0, right - 1), min(right + 1, len(self._stamps_ns))),
-            key=lambda index: abs(self._stamps_ns[index] - (estimate.stamp_ns or 0)),
-        )
-        difference = abs(self._stamps_ns[nearest] - estimate.stamp_ns)
-        return self._poses[nearest] if difference <= _MAX_STAMP_DIFFERENCE_NS else None
+        nearest = nearest_stamp(self._stamps_ns, estimate.stamp_ns, MAX_STAMP_DIFFERENCE_NS)
+        return None if nearest is None else self._poses[nearest]
 
 
 def open_ground_truth(path: Path) -> GroundTruth:
@@ -107,14 +135,7 @@ def _read_tum(path: Path) -> tuple[list[int], list[Array]]:
                 f"{path}: expected eight numbers stamp tx ty tz qx qy qz qw, found {line!r} "
                 f"in line {number}"
             )
-        seconds, _, fraction = fields[0].partition(".")
-        exact = seconds.isdecimal() and (fraction.isdecimal() or not fraction)
-        stamp = (
-            # A double holds present-day stamps to 200 ns only: count the digits instead.
-            int(seconds) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
-            if exact
-            else round(values[0] * 1e9)
-        )
+        stamp = seconds_to_ns(fields[0])
         if stamps and stamp <= stamps[-1]:
             raise SourceError(
                 f"{path}: expected growing stamps, found {fields[0]} in line {number}"

@@ -7,7 +7,7 @@ import sys
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -15,12 +15,16 @@ from cvo_edge.cli import ScopeName, guarded, write_text
 from cvo_edge.errors import UsageError
 from cvo_export.progress import show_progress
 
+if TYPE_CHECKING:
+    from cvo_export.datasets import PoseDataset
+
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="Train a pose network with bounds, export it to one ONNX graph, calibrate it, evaluate "
-    "it. DATASET is FORMAT:PATH, e.g. 7scenes:scenes/redkitchen or synthetic:room.",
+    "it. DATASET is FORMAT:PATH, e.g. 7scenes:scenes/redkitchen or synthetic:room; formats are "
+    "7scenes, rgbd-scenes, tum, kitti, euroc and synthetic.",
 )
 
 
@@ -192,6 +196,16 @@ CopiesOption = Annotated[
 StepsOption = Annotated[int | None, typer.Option(min=100, help="Steps of training the head.")]
 
 
+def _open(dataset: str) -> PoseDataset:
+    """Open a data set and say on stderr what was read, and what was left out and why."""
+    from cvo_export.datasets import open_dataset
+    from cvo_export.datasets.describe import summary
+
+    opened = open_dataset(dataset)
+    print(summary(opened), file=sys.stderr, flush=True)
+    return opened
+
+
 @app.command()
 def train(
     method: Annotated[
@@ -331,12 +345,14 @@ def train(
     Options that begin with the name of a method belong to that method.
     """
     from cvo_export.configure import configure
+    from cvo_export.splits import default_kind
     from cvo_export.train import train as train_run
 
+    opened = _open(dataset)
     config = configure(
         method=method.value,
         dataset=dataset,
-        split=split.value if split else None,
+        split=split.value if split else default_kind(opened),
         seed=seed,
         size=size,
         crop=crop.value,
@@ -464,12 +480,11 @@ def calibrate(
     and, for intervals that adapt, lower and upper [1, 6].
     """
     from cvo_edge.describe import inspect_lines
-    from cvo_export.datasets import open_dataset
     from cvo_export.recalibrate import recalibrate
 
     calibration = recalibrate(
         model,
-        open_dataset(dataset),
+        _open(dataset),
         bundle,
         name or bundle.resolve().name,
         kind=split.value if split else None,
@@ -514,13 +529,12 @@ def evaluate(
     calibration frames degraded alike. NAME is gaussian, salt-and-pepper, speckle, motion-blur,
     exposure or occlusion.
     """
-    from cvo_export.datasets import open_dataset
     from cvo_export.evaluate import check_coverage, table
     from cvo_export.evaluate import evaluate as evaluate_bundle
     from cvo_export.noise import parse_noise
 
     parsed = None if noise is None else parse_noise(noise)
-    report = evaluate_bundle(bundle, open_dataset(dataset), subset.value, threads, parsed)
+    report = evaluate_bundle(bundle, _open(dataset), subset.value, threads, parsed)
     if json_file is not None:
         write_text(json_file, json.dumps(report, indent=1) + "\n")
     if json_file != "-":
@@ -561,6 +575,7 @@ def compare(
     from cvo_export.compare import compare as compare_methods
     from cvo_export.methods import TRAINABLE
 
+    _open(dataset)
     options = {
         "dataset": dataset,
         "split": split.value if split else None,
@@ -603,12 +618,11 @@ def plot(
     ] = ScopeName.MARGINAL,
 ) -> None:
     """Draw truth, point and bands of each degree of freedom, and x against y."""
-    from cvo_export.datasets import open_dataset
     from cvo_export.plot import plot as draw
 
     draw(
         bundle,
-        open_dataset(dataset),
+        _open(dataset),
         out,
         subset=subset.value,
         sequence=sequence,
@@ -626,10 +640,9 @@ def render(
     frames: Annotated[int | None, typer.Option(min=1, help="Only the first so many.")] = None,
 ) -> None:
     """Write one sequence as a 7-Scenes folder: JPEG images and .pose.txt."""
-    from cvo_export.datasets import open_dataset
     from cvo_export.datasets.seven_scenes import write_sequence
 
-    opened = open_dataset(dataset)
+    opened = _open(dataset)
     if sequence not in opened.sequence_names:
         raise UsageError(
             f"sequence: expected one of {opened.sequence_names[0]} to "
@@ -637,6 +650,15 @@ def render(
         )
     count = write_sequence(opened, opened.sequence_names.index(sequence), folder, frames)
     print(f"{folder}: {count} frames of {sequence}")
+
+
+@app.command()
+def dataset(dataset: DatasetArgument) -> None:
+    """Say what a reader finds: frames, skipped ones and why, sequences, camera, extent."""
+    from cvo_export.datasets import open_dataset
+    from cvo_export.datasets.describe import describe
+
+    print(*describe(open_dataset(dataset)), sep="\n")
 
 
 def main() -> NoReturn:

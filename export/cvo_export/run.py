@@ -150,12 +150,9 @@ class Run:
     def lines(self) -> list[str]:
         """Return what was trained as lines of text for a person."""
         counts = ", ".join(f"{role} {indices.size}" for role, indices in self.split.roles.items())
-        skipped = ", ".join(f"{count} {reason}" for reason, count in self.dataset.skipped.items())
         best = self.best
         parameters = sum(parameter.numel() for parameter in self.graph.parameters())
         return [
-            f"data set    {self.dataset.name}: {len(self.dataset)} frames, {skipped or 'none'} "
-            "skipped",
             f"split       {self.split.kind}: {counts}",
             f"network     {self.config.backbone.name}, {parameters / 1e6:.2f} M parameters",
             f"best        val score {best.val_score:.3f} at step {best.step} ({best.lesson})",

@@ -6,19 +6,29 @@ from collections.abc import Callable
 
 from cvo_edge.errors import UsageError
 from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.euroc import open_euroc
+from cvo_export.datasets.kitti import open_kitti
+from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
 from cvo_export.datasets.seven_scenes import open_seven_scenes
 from cvo_export.datasets.synthetic import open_room
+from cvo_export.datasets.tum import open_tum
 
 __all__ = ["FORMATS", "Intrinsics", "PoseDataset", "open_dataset"]
 
 FORMATS: dict[str, Callable[[str], PoseDataset]] = {
     "7scenes": open_seven_scenes,
+    "rgbd-scenes": open_rgbd_scenes,
+    "tum": open_tum,
+    "kitti": open_kitti,
+    "euroc": open_euroc,
     "synthetic": open_room,
 }
 
 
 def open_dataset(text: str) -> PoseDataset:
     """Open ``FORMAT:PATH``, e.g. ``7scenes:scenes/redkitchen`` or ``synthetic:room``.
+
+    What a path is and what the poses mean each format's module says.
 
     Raises
     ------

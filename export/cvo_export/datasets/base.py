@@ -18,6 +18,10 @@ class Intrinsics(NamedTuple):
     cx: float
     cy: float
 
+    def scaled(self, factor: float) -> Intrinsics:
+        """Return the same camera for images ``factor`` times as large."""
+        return Intrinsics(*(factor * value for value in self))
+
 
 @dataclass(frozen=True)
 class PoseDataset:
@@ -61,3 +65,11 @@ class PoseDataset:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+
+def skipped_text(skipped: Mapping[str, int]) -> str:
+    """Return how many frames a reader left out and why, e.g. ``skipped 3: invalid pose 3``."""
+    if not skipped:
+        return "none skipped"
+    reasons = ", ".join(f"{reason} {count}" for reason, count in skipped.items())
+    return f"skipped {sum(skipped.values())}: {reasons}"

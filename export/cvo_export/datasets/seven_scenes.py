@@ -7,18 +7,18 @@ A pose file holds the 4x4 camera-to-world matrix in metres, OpenCV camera. ``Tra
 from __future__ import annotations
 
 import re
-from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cvo_edge.errors import SinkError, SourceError
 from cvo_edge.pose import Pose
-from cvo_edge.sources import decode_image, natural_key
+from cvo_edge.sources import natural_key
 from cvo_edge.trajectory import MATRIX_SUFFIX, read_pose_matrix
 from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.frames import FrameList
 
 _COLOUR = (".color.png", ".color.jpg")
 
@@ -40,48 +40,21 @@ def open_seven_scenes(path: str) -> PoseDataset:
         raise SourceError(f"{root}: expected a 7-Scenes folder, found none")
     folders = sorted(root.glob("seq-*"), key=natural_key)
     folders = [folder for folder in folders if folder.is_dir()] or [root]
-    skipped: Counter[str] = Counter()
-    images: list[Path] = []
-    poses: list[NDArray[np.float64]] = []
-    sequence: list[int] = []
-    for number, folder in enumerate(folders):
+    frames = FrameList(root)
+    for folder in folders:
         for image in _colour_images(folder):
-            pose_file = folder / (image.name.split(".")[0] + MATRIX_SUFFIX)
-            if not pose_file.is_file():
-                skipped["no pose file"] += 1
-                continue
-            pose = read_pose_matrix(pose_file)
-            if pose is None:
-                skipped["invalid pose"] += 1
-                continue
-            images.append(image)
-            poses.append(pose)
-            sequence.append(number)
-    if not images:
-        found = ", ".join(f"{count} with {reason}" for reason, count in skipped.items()) or "none"
-        raise SourceError(f"{root}: expected frames with a pose, found {found}")
-    names = tuple(folder.name for folder in folders)
-
-    def read_image(index: int) -> NDArray[np.uint8]:
-        image = decode_image(images[index].read_bytes())
-        if image is None:
-            raise SourceError(f"{images[index]}: expected a whole image, found a damaged one")
-        return image
-
-    return PoseDataset(
-        name=root.resolve().name,
-        poses=np.array(poses),
-        sequence=np.array(sequence),
-        sequence_names=names,
-        frame_names=tuple(
-            f"{names[number]}/{image.name.split('.')[0]}"
-            for number, image in zip(sequence, images, strict=True)
-        ),
-        read_image=read_image,
-        intrinsics=_intrinsics(root, read_image(0).shape),
-        own_train=_own_list(root / "TrainSplit.txt", names),
-        own_test=_own_list(root / "TestSplit.txt", names),
-        skipped=dict(skipped),
+            name = image.name.split(".")[0]
+            pose_file = folder / (name + MATRIX_SUFFIX)
+            if pose_file.is_file():
+                frames.add(folder.name, name, image, read_pose_matrix(pose_file))
+            else:
+                frames.skip("no pose file")
+    dataset = frames.dataset(root.resolve().name)
+    return replace(
+        dataset,
+        intrinsics=_intrinsics(root, dataset.read_image(0).shape),
+        own_train=_own_list(root / "TrainSplit.txt", dataset.sequence_names),
+        own_test=_own_list(root / "TestSplit.txt", dataset.sequence_names),
     )
 
 

@@ -1,0 +1,43 @@
+"""A data set as text for a person: what was read, and what was left out and why."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cvo_export.datasets.base import PoseDataset, skipped_text
+
+
+def summary(dataset: PoseDataset) -> str:
+    """One line: name, frames, sequences and skipped frames."""
+    frames = _counted(len(dataset), "frame")
+    sequences = _counted(len(dataset.sequence_names), "sequence")
+    return f"{dataset.name:<11} {frames} in {sequences}; {skipped_text(dataset.skipped)}"
+
+
+def describe(dataset: PoseDataset) -> list[str]:
+    """The summary, then image, camera, extent of the positions and frames of each sequence.
+
+    Raises SourceError where the first image cannot be read.
+    """
+    height, width = dataset.read_image(0).shape[:2]
+    camera = "not stated"
+    if dataset.intrinsics is not None:
+        numbers = dataset.intrinsics._asdict()
+        camera = ", ".join(f"{name} {value:.1f}" for name, value in numbers.items()) + " px"
+    position_m = dataset.poses[:, :3]
+    extent = zip("xyz", position_m.min(axis=0), position_m.max(axis=0), strict=True)
+    counts = np.bincount(dataset.sequence, minlength=len(dataset.sequence_names))
+    return [
+        summary(dataset),
+        f"image       {width} x {height} px",
+        f"camera      {camera}",
+        "positions   " + ", ".join(f"{axis} {a:.2f} .. {b:.2f}" for axis, a, b in extent) + " m",
+        *(
+            f"sequence    {name}: {count}"
+            for name, count in zip(dataset.sequence_names, counts, strict=True)
+        ),
+    ]
+
+
+def _counted(count: int, word: str) -> str:
+    return f"{count} {word}{'' if count == 1 else 's'}"

@@ -1,0 +1,108 @@
+"""EuRoC MAV (Burri et al. 2016), the ASL layout: ``mav0/cam0`` and the ground truth beside it.
+
+``cam0/data.csv`` lists ``timestamp,filename`` of the images in ``cam0/data``, and
+``state_groundtruth_estimate0/data.csv`` states ``timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z,...``:
+integer nanoseconds, metres and a quaternion, scalar first. That is the pose of the body (the IMU)
+in the world. ``T_BS`` of ``cam0/sensor.yaml`` is ``T_body_camera``, so that
+
+    T_world_camera = T_world_body @ T_BS
+
+Images are grey and given as BGR. Their lens distortion is not corrected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from cvo_edge.errors import SourceError
+from cvo_edge.trajectory import matrix_to_pose
+from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.folders import only_camera, recordings
+from cvo_export.datasets.frames import FrameList
+from cvo_export.datasets.poses import camera_pose, quaternion_pose
+from cvo_export.datasets.stamps import add_associated
+from cvo_export.datasets.tables import read_rows, read_text
+
+Array = NDArray[np.float64]
+
+_IMAGES = "mav0/cam0/data.csv"
+_CAMERA = "mav0/cam0/sensor.yaml"
+_POSES = "mav0/state_groundtruth_estimate0/data.csv"
+
+# One period of the ground truth (200 Hz). Camera and IMU are triggered together and the ground
+# truth has the IMU's stamps, so that the nearest one is the image's own: nothing to interpolate.
+_MAX_STAMP_DIFFERENCE_NS = 5_000_000
+
+
+def open_euroc(path: str) -> PoseDataset:
+    """Read a recording, the folder that holds ``mav0``, or the recordings in a folder.
+
+    Several recordings make sense where they share the world frame, as those of one room do
+    (``V1_01`` to ``V1_03``, ``V2_01`` to ``V2_03``); no file says so. Each image gets the pose of
+    the nearest stamp. Frames without one within 5 ms, with an invalid one or without their image
+    are left out and counted. Intrinsics are given where ``sensor.yaml`` states a pinhole with
+    radial-tangential distortion.
+
+    Raises SourceError where a file is missing or malformed, recordings are of two cameras, or there
+    is no posed frame.
+    """
+    root = Path(path)
+    frames = FrameList(root)
+    cameras: dict[str, Intrinsics | None] = {}
+    for name, folder in recordings(root, _IMAGES).items():
+        cameras[name], T_body_camera = _read_camera(folder / _CAMERA)
+        _add_recording(frames, name, folder, T_body_camera)
+    dataset = frames.dataset(root.resolve().name)
+    return replace(dataset, intrinsics=only_camera(root, cameras))
+
+
+def _add_recording(frames: FrameList, name: str, folder: Path, T_body_camera: Array) -> None:
+    listed = read_rows(folder / _IMAGES, "timestamp,filename", separator=",")
+    image_folder = (folder / _IMAGES).with_name("data")
+    images = [(row.nanoseconds(), image_folder / row.fields[1]) for row in listed]
+    form = "timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z"
+    rows = read_rows(folder / _POSES, form, separator=",", more=True)
+    values = [row.numbers(1) for row in rows]
+
+    def pose_of(place: int) -> Array | None:
+        body = quaternion_pose(values[place][:3], np.roll(values[place][3:], -1))
+        return camera_pose(body, T_body_camera)
+
+    stamps_ns = [row.nanoseconds() for row in rows]
+    add_associated(frames, name, images, stamps_ns, pose_of, _MAX_STAMP_DIFFERENCE_NS)
+
+
+def _read_camera(path: Path) -> tuple[Intrinsics | None, Array]:
+    """Return the intrinsics and ``T_body_camera``, shape (4, 4), metres."""
+    text = read_text(path, "a camera's T_BS and intrinsics")
+    # OpenCV's tools want a first line %YAML:1.0, which is no YAML.
+    text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
+    try:
+        document: Any = yaml.safe_load(text)
+    except yaml.YAMLError:
+        document = None
+    if not isinstance(document, dict):
+        raise SourceError(f"{path}: expected YAML with T_BS and intrinsics, found none")
+    T_BS = document.get("T_BS")
+    matrix = _numbers(T_BS.get("data") if isinstance(T_BS, dict) else T_BS, 16)
+    if matrix is None or matrix_to_pose(matrix.reshape(4, 4)) is None:
+        raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid motion, found {T_BS}")
+    intrinsics = _numbers(document.get("intrinsics"), 4)
+    model = document.get("camera_model"), document.get("distortion_model")
+    if intrinsics is None or model != ("pinhole", "radial-tangential"):
+        return None, matrix.reshape(4, 4)
+    return Intrinsics(*intrinsics.tolist()), matrix.reshape(4, 4)
+
+
+def _numbers(values: object, count: int) -> Array | None:
+    try:
+        numbers = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return numbers if numbers.shape == (count,) else None

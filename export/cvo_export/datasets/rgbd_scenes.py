@@ -1,0 +1,56 @@
+"""RGB-D Scenes v2 (Lai et al. 2014): ``imgs/scene_NN/NNNNN-color.png`` with ``pc/NN.pose``.
+
+Line i of a pose file, counted from 0, belongs to image i and holds ``a b c d x y z``: the
+quaternion a + bi + cj + dk, scalar first, then the camera's position in metres; together
+``T_world_camera`` of an OpenCV camera. The world frame is that of the scene's first camera, so that
+poses of two scenes are not comparable: a data set is one scene. Depth images are not read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from cvo_edge.sources import natural_key
+from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.folders import only_world
+from cvo_export.datasets.frames import FrameList
+from cvo_export.datasets.poses import quaternion_pose
+from cvo_export.datasets.tables import read_rows
+
+_COLOUR = "-color.png"
+
+# What the data set's authors make points of depth images with, for 640x480.
+_NOMINAL, _NOMINAL_WIDTH = Intrinsics(570.3, 570.3, 320.0, 240.0), 640
+
+
+def open_rgbd_scenes(path: str) -> PoseDataset:
+    """Read one scene: ``ROOT/imgs/scene_NN``, with its poses in ``ROOT/pc/NN.pose``.
+
+    ``ROOT`` will do where it holds a single scene. Frames without an image or a pose, or with one
+    that is no pose, are left out and counted. Intrinsics are the authors' nominal ones, scaled to
+    the images' width.
+
+    Raises SourceError where there are several scenes, no posed frame, or a line that is no pose's.
+    """
+    root = Path(path).absolute()
+    folder = root
+    if not any(root.glob("*" + _COLOUR)):
+        found = {file.parent for file in root.glob(f"imgs/scene_*/*{_COLOUR}")}
+        folder = only_world(root, sorted(found, key=natural_key), "scene imgs/scene_NN")
+    frames = FrameList(folder)
+    images = {
+        int(file.name.removesuffix(_COLOUR)): file
+        for file in folder.glob("*" + _COLOUR)
+        if file.name.removesuffix(_COLOUR).isdecimal()
+    }
+    pose_file = folder.parent.parent / "pc" / f"{folder.name.removeprefix('scene_')}.pose"
+    rows = read_rows(pose_file, "a b c d x y z", comments=False)
+    numbers = [row.numbers() for row in rows]
+    poses = [quaternion_pose(values[4:], np.roll(values[:4], -1)) for values in numbers]
+    frames.add_numbered(folder.name, images, poses)
+    dataset = frames.dataset(folder.name)
+    width = dataset.read_image(0).shape[1]
+    return replace(dataset, intrinsics=_NOMINAL.scaled(width / _NOMINAL_WIDTH))

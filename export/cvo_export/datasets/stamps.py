@@ -1,0 +1,48 @@
+"""Images and poses with a clock each: every image gets the pose of the nearest stamp."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.trajectory import nearest_stamp
+from cvo_export.datasets.frames import FrameList
+
+Array = NDArray[np.float64]
+
+
+def add_associated(
+    frames: FrameList,
+    sequence: str,
+    images: Sequence[tuple[int, Path]],
+    stamps_ns: Sequence[int],
+    pose_of: Callable[[int], Array | None],
+    bound_ns: int,
+) -> None:
+    """Add a sequence in the order of its images' stamps.
+
+    Parameters
+    ----------
+    frames
+        Where the frames are added.
+    sequence
+        Its name.
+    images
+        Stamp, in nanoseconds, and file of each image.
+    stamps_ns, pose_of
+        Stamps of the poses, in any order, and the pose (7,) of a place in them, None where it is
+        invalid.
+    bound_ns
+        An image whose nearest pose is further away is left out and counted.
+    """
+    order = sorted(range(len(stamps_ns)), key=stamps_ns.__getitem__)
+    ascending = [stamps_ns[place] for place in order]
+    for stamp_ns, image in sorted(images, key=lambda image: image[0]):
+        nearest = nearest_stamp(ascending, stamp_ns, bound_ns)
+        if nearest is None:
+            frames.skip(f"no pose within {bound_ns / 1e9:g} s")
+        else:
+            frames.add(sequence, image.stem, image, pose_of(order[nearest]))

@@ -1,0 +1,74 @@
+"""TUM RGB-D (Sturm et al. 2012): ``rgb.txt`` lists images, ``groundtruth.txt`` poses, by stamp.
+
+A line of ``groundtruth.txt`` is ``timestamp tx ty tz qx qy qz qw``: seconds, metres and a
+quaternion, scalar last; together ``T_world_camera`` of the colour camera (OpenCV), in the frame of
+the motion capture system. Lines that begin with ``#`` are comments. Depth images are not read, and
+the lens distortion of freiburg1 and freiburg2 is not corrected.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from cvo_edge.trajectory import MAX_STAMP_DIFFERENCE_NS
+from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.folders import only_camera, recordings
+from cvo_export.datasets.frames import FrameList
+from cvo_export.datasets.poses import quaternion_pose
+from cvo_export.datasets.stamps import add_associated
+from cvo_export.datasets.tables import read_rows
+
+# The colour cameras as the data set's authors calibrated them ("File formats", table of intrinsics
+# of the RGB cameras), for 640x480. The images of freiburg3 are undistorted already.
+_CAMERAS = {
+    "1": Intrinsics(517.3, 516.5, 318.6, 255.3),
+    "2": Intrinsics(520.9, 521.0, 325.1, 249.7),
+    "3": Intrinsics(535.4, 539.2, 320.1, 247.6),
+}
+_NOMINAL_WIDTH = 640
+
+
+def open_tum(path: str) -> PoseDataset:
+    """Read a sequence folder, or the sequence folders in a folder.
+
+    Several sequences make sense where they share the world frame, as recordings in one room with
+    one set-up of the motion capture system do; no file says so. Each image gets the pose of the
+    nearest stamp. Frames without one within 0.02 s, with an invalid one or without their image are
+    left out and counted. Intrinsics are known where the folder's name says freiburg1, 2 or 3 (or
+    fr1, 2 or 3), and scaled to the images' width.
+
+    Raises SourceError where a list is missing or malformed, sequences are of two cameras, or there
+    is no posed frame.
+    """
+    root = Path(path)
+    folders = recordings(root, "rgb.txt")
+    frames = FrameList(root)
+    for name, folder in folders.items():
+        _add_sequence(frames, name, folder)
+    dataset = frames.dataset(root.resolve().name)
+    camera = only_camera(root, {name: _camera(name) for name in folders})
+    if camera is not None:
+        camera = camera.scaled(dataset.read_image(0).shape[1] / _NOMINAL_WIDTH)
+    return replace(dataset, intrinsics=camera)
+
+
+def _add_sequence(frames: FrameList, name: str, folder: Path) -> None:
+    listed = read_rows(folder / "rgb.txt", "timestamp filename")
+    images = [(row.seconds(), folder / row.fields[1]) for row in listed]
+    rows = read_rows(folder / "groundtruth.txt", "timestamp tx ty tz qx qy qz qw")
+    values = [row.numbers(1) for row in rows]
+    add_associated(
+        frames,
+        name,
+        images,
+        [row.seconds() for row in rows],
+        lambda place: quaternion_pose(values[place][:3], values[place][3:]),
+        MAX_STAMP_DIFFERENCE_NS,
+    )
+
+
+def _camera(name: str) -> Intrinsics | None:
+    found = re.search(r"(?<![a-z0-9])fr(?:eiburg)?([123])(?![a-z0-9])", name)
+    return _CAMERAS[found[1]] if found else None
