@@ -25,7 +25,7 @@ $(DEMO_VENV)/.installed: pyproject.toml
 $(VENV)/.installed: pyproject.toml export/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet $(TORCH_PIP_OPTIONS) torch torchvision
-	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable "./export[plot]"
+	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable "./export[plot,ray]"
 	@touch $@
 
 demo: $(addprefix demo-,$(METHODS))

@@ -43,6 +43,13 @@ class MethodName(StrEnum):
     SPLIT = "split"
 
 
+class EngineName(StrEnum):
+    """Where the cells of a study are run."""
+
+    LOCAL = "local"
+    RAY = "ray"
+
+
 class SplitName(StrEnum):
     """How frames get their roles."""
 
@@ -601,6 +608,46 @@ def compare(
             say=partial(print, file=sys.stderr, flush=True),
         )
     print(*lines, sep="\n")
+
+
+@app.command()
+def study(
+    config: Annotated[Path, typer.Argument(help="Grids to run, TOML.", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="Folder of the study; or one to go on with.")],
+    engine: Annotated[
+        EngineName, typer.Option(help="Processes of this machine, or a Ray cluster.")
+    ] = EngineName.LOCAL,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="local: runs at a time; all allowed cores by default.")
+    ] = None,
+    cache: Annotated[
+        Path | None, typer.Option(help="Folder of features; by default in OUT.")
+    ] = None,
+) -> None:
+    """Run grids of methods, backbones, data, noise, options and seeds, and report on them.
+
+    Interrupted, the same command goes on. OUT gets results.json, report.html and pictures.
+    """
+    from cvo_edge.session import allowed_cores
+    from cvo_export.cells import CellFolder
+    from cvo_export.ray_engine import run_tasks_on_ray
+    from cvo_export.study import read_study, run_study
+    from cvo_export.study_report import write_report
+    from cvo_export.workers import run_tasks
+
+    if engine is EngineName.RAY and jobs is not None:
+        raise UsageError("jobs: expected with the engine local alone, found it with ray")
+    on_this_machine = partial(run_tasks, jobs or allowed_cores())
+    with show_progress() as progress:
+        folder = CellFolder(out.resolve(), (cache or out / "features").resolve())
+        results = run_study(
+            read_study(config),
+            folder,
+            on_this_machine if engine is EngineName.LOCAL else run_tasks_on_ray,
+            progress,
+            partial(print, file=sys.stderr, flush=True),
+        )
+    print(write_report(results, folder))
 
 
 @app.command()

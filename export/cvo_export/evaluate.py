@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from scipy.stats import betabinom
+from scipy.stats import betabinom, spearmanr
 
 from cvo_edge import geometry
 from cvo_edge.artifact import Calibration, Threshold, read_bundle
@@ -390,7 +390,11 @@ class _Sets:
             "joint_coverage": self.covered_jointly(regions),
             **self.widths(limited, alpha),
             "unbounded_share": float(1.0 - bounded.mean()),
-            **(self.volumes(limited) if entry.scope == "joint" else {}),
+            **(
+                self.volumes(limited)
+                if entry.scope == "joint"
+                else {"adaptiveness": self.adaptiveness(limited)}
+            ),
             **self.pieces(regions),
         }
 
@@ -404,6 +408,28 @@ class _Sets:
             "median_width": np.median(width, axis=0).tolist(),
             "interval_score": score.tolist(),
             "normalised_interval_score": float((score / self.deviation).mean()),
+        }
+
+    def adaptiveness(self, regions: list[ConformalSet]) -> dict[str, float | None]:
+        """How far widths follow the point's errors, mean over the degrees of freedom.
+
+        ``width_ratio``: mean width on the third of the frames with the largest errors over that on
+        the third with the least; ``rank_correlation``: Spearman's, of width and error. None where a
+        degree of freedom has one width for all frames, or too few frames.
+        """
+        width = np.array([region.width() for region in regions])
+        error = np.abs(self.seen.truth - self.seen.point)
+        third = len(error) // 3
+        if third == 0 or not np.all(np.ptp(width, axis=0) > 0.0):
+            return {"width_ratio": None, "rank_correlation": None}
+        ratios, correlations = [], []
+        for dof in range(width.shape[1]):
+            ordered = width[np.argsort(error[:, dof]), dof]
+            ratios.append(ordered[-third:].mean() / ordered[:third].mean())
+            correlations.append(spearmanr(width[:, dof], error[:, dof]).statistic)
+        return {
+            "width_ratio": float(np.mean(ratios)),
+            "rank_correlation": float(np.mean(correlations)),
         }
 
     def volumes(self, regions: list[ConformalSet]) -> dict[str, Any]:

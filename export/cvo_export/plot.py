@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.artifact import Calibration
 from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import Chart, PoseInterval, Scope
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 # Colours that differ for colour-blind readers, too (Okabe and Ito 2008).
-_TRUTH, _POINT, _BAND, _MISSED = "#000000", "#0072B2", "#56B4E9", "#D55E00"
+TRUTH, POINT, BAND, MISSED = "#000000", "#0072B2", "#56B4E9", "#D55E00"
+# More boxes than these hide one another.
+BOXES = 60
 _DPI = 130
 
 
@@ -59,6 +62,52 @@ def plot(
     known = FigureCanvasAgg(Figure()).get_supported_filetypes()
     if out.suffix[1:].lower() not in known or out.is_dir():
         raise UsageError(f"out: expected a file .{', .'.join(sorted(known))}, found {out}")
+    drawn = track(bundle_dir, dataset, subset, sequence, confidence, scope)
+    figure = Figure(figsize=(15, 11), layout="constrained")
+    grid = figure.add_gridspec(3, 3)
+    for dof in range(6):
+        draw_dof(figure.add_subplot(grid[dof % 3, dof // 3]), drawn, dof)
+    draw_from_above(figure.add_subplot(grid[:2, 2]), drawn)
+    calibration = drawn.calibration
+    figure.suptitle(
+        f"{calibration.name}: {calibration.method}, {calibration.calibration.score} score, "
+        f"{confidence:g} {scope}, {len(drawn.rows)} frames of {dataset.name}"
+        + (f", {sequence}" if sequence else "")
+    )
+    partial = out.with_name(f".partial-{out.name}")
+    try:
+        figure.savefig(partial, dpi=_DPI)
+        partial.replace(out)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise SinkError(f"{out}: cannot be written: {error.strerror}") from None
+
+
+class Track(NamedTuple):
+    """Frames through a bundle: every estimate, true numbers (n, 6) in its chart, NaN without one.
+
+    ``rows`` are the frames whose estimate has a pose.
+    """
+
+    calibration: Calibration
+    chart: Chart
+    estimates: list[PoseInterval]
+    truth: Array
+    rows: list[int]
+
+
+def track(
+    bundle_dir: Path,
+    dataset: PoseDataset,
+    subset: Subset = "test",
+    sequence: str | None = None,
+    confidence: float = 0.9,
+    scope: Scope = "marginal",
+) -> Track:
+    """Run frames through a bundle, those of one sequence or all of a subset.
+
+    Raises UsageError for an unknown sequence, SourceError where no frame gives a pose.
+    """
     with Odometer.load(bundle_dir, confidence=confidence, scope=scope) as odometer:
         indices = subset_indices(odometer.calibration, dataset, subset)
         if sequence is not None:
@@ -73,26 +122,8 @@ def plot(
         rows = [row for row, estimate in enumerate(estimates) if estimate.pose is not None]
         if not rows:
             raise SourceError(f"{dataset.name}: expected frames with a pose, found none")
-        figure = Figure(figsize=(15, 11), layout="constrained")
-        grid = figure.add_gridspec(3, 3)
         truth = _truth(odometer.chart, estimates, dataset.poses[indices])
-        for dof in range(6):
-            axes = figure.add_subplot(grid[dof % 3, dof // 3])
-            _draw_dof(axes, odometer.chart, estimates, truth, rows, dof)
-        _draw_from_above(figure.add_subplot(grid[:2, 2]), estimates, truth, rows)
-        calibration = odometer.calibration
-        figure.suptitle(
-            f"{calibration.name}: {calibration.method}, {calibration.calibration.score} score, "
-            f"{confidence:g} {scope}, {len(rows)} frames of {dataset.name}"
-            + (f", {sequence}" if sequence else "")
-        )
-    partial = out.with_name(f".partial-{out.name}")
-    try:
-        figure.savefig(partial, dpi=_DPI)
-        partial.replace(out)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise SinkError(f"{out}: cannot be written: {error.strerror}") from None
+        return Track(odometer.calibration, odometer.chart, estimates, truth, rows)
 
 
 def _step(odometer: Odometer, dataset: PoseDataset, index: int) -> PoseInterval:
@@ -112,14 +143,9 @@ def _truth(chart: Chart, estimates: list[PoseInterval], poses: Array) -> Array:
     return truth
 
 
-def _draw_dof(
-    axes: Axes,
-    chart: Chart,
-    estimates: list[PoseInterval],
-    truth: Array,
-    rows: list[int],
-    dof: int,
-) -> None:
+def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
+    """Draw one degree of freedom over the frames: sets, point, truth, and what was missed."""
+    _, chart, estimates, truth, rows = drawn
     scale, unit = (1.0, "m") if dof < 3 else (float(np.rad2deg(1.0)), "deg")
     shown = scale * truth[rows, dof]
     point = np.array([chart.point(_array(estimates[row]))[dof] for row in rows])
@@ -140,12 +166,12 @@ def _draw_dof(
         whole = estimate.region.ellipsoids
         if not (whole.contains(truth[row]) if whole else estimate.region.covers(truth[row])[dof]):
             missed.append(row)
-    axes.bar(places, heights, 1.0, bottoms, color=_BAND, alpha=0.6, linewidth=0, label="set")
-    axes.plot(rows, scale * point, color=_POINT, linewidth=0.9, label="point")
-    axes.plot(rows, shown, color=_TRUTH, linewidth=0.9, label="truth")
+    axes.bar(places, heights, 1.0, bottoms, color=BAND, alpha=0.6, linewidth=0, label="set")
+    axes.plot(rows, scale * point, color=POINT, linewidth=0.9, label="point")
+    axes.plot(rows, shown, color=TRUTH, linewidth=0.9, label="truth")
     regions = any(estimates[row].region.ellipsoids for row in rows)
     label = "outside of the region of all six" if regions else "missed"
-    axes.plot(missed, scale * truth[missed, dof], "x", color=_MISSED, markersize=5, label=label)
+    axes.plot(missed, scale * truth[missed, dof], "x", color=MISSED, markersize=5, label=label)
     axes.set_ylim(shown.min() - 0.4 * spread, shown.max() + 0.4 * spread)
     kind = " about the prediction" if dof > 2 and chart.rotation == "tangent_predicted" else ""
     axes.set_ylabel(f"{chart.dof[dof]} ({unit}){kind}")
@@ -155,22 +181,21 @@ def _draw_dof(
         axes.legend(loc="best", ncols=4, fontsize=8)
 
 
-def _draw_from_above(
-    axes: Axes, estimates: list[PoseInterval], truth: Array, rows: list[int]
-) -> None:
+def draw_from_above(axes: Axes, drawn: Track) -> None:
     """X against y: the product of both sets as boxes, for as many frames as can be told apart."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
+    _, _, estimates, truth, rows = drawn
     boxes = []
-    for row in rows[:: max(1, len(rows) // 60)]:
+    for row in rows[:: max(1, len(rows) // BOXES)]:
         plane = np.unique(estimates[row].position_boxes()[:, :2], axis=0)
         if np.isfinite(plane).all():
             boxes += [Rectangle((x[0], y[0]), x[1] - x[0], y[1] - y[0]) for x, y in plane]
-    axes.add_collection(PatchCollection(boxes, facecolor=_BAND, edgecolor=_POINT, alpha=0.25))
+    axes.add_collection(PatchCollection(boxes, facecolor=BAND, edgecolor=POINT, alpha=0.25))
     points = np.array([_array(estimates[row])[:2] for row in rows])
-    axes.plot(*points.T, ".", color=_POINT, markersize=3, label="point")
-    axes.plot(*truth[rows, :2].T, ".", color=_TRUTH, markersize=3, label="truth")
+    axes.plot(*points.T, ".", color=POINT, markersize=3, label="point")
+    axes.plot(*truth[rows, :2].T, ".", color=TRUTH, markersize=3, label="truth")
     axes.set_xlabel("tx (m)")
     axes.set_ylabel("ty (m)")
     axes.set_aspect("equal", "datalim")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
 import torch
+from msgspec import Meta
 from torch import Tensor, nn
 
 from cvo_edge.errors import SinkError, UsageError
@@ -50,6 +51,8 @@ class TrainConfig:
     fine_tune, backbone_learning_rate
         Epochs in which the backbone learns, too, on fresh augmented images; the copies are then
         computed anew and the head trained once more.
+    share
+        Of the training frames, how many are used: to see what a method needs.
     """
 
     dataset: str
@@ -71,6 +74,7 @@ class TrainConfig:
     averaging: float = 0.995
     fine_tune: int = 0
     backbone_learning_rate: float = 3e-4
+    share: Annotated[float, Meta(gt=0, le=1)] = 1.0
 
     @property
     def method(self) -> str:

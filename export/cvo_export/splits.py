@@ -159,6 +159,28 @@ def deal_folds(dataset: PoseDataset, split: Split, indices: Indices, count: int)
     return [np.flatnonzero(fold_of[unit] == number) for number in range(count)]
 
 
+def training_frames(dataset: PoseDataset, split: Split, share: float) -> tuple[Indices, Indices]:
+    """Frame numbers of the roles train and fit, or of a share of each, drawn by the split's seed.
+
+    Whole frames of a random split, sequences or runs of neighbours of the others; at least one of
+    each. A smaller share is a part of a larger one.
+    """
+    if share == 1.0:
+        return split.roles["train"], split.roles["fit"]
+    found = []
+    for number, role in enumerate(("train", "fit")):
+        indices = split.roles[role]
+        unit = np.arange(indices.size)
+        if split.kind == "sequence":
+            unit = dataset.sequence[indices]
+        elif split.kind == "block":
+            unit = np.cumsum(np.diff(indices, prepend=indices[:1]) != 1)
+        names = np.unique(unit)
+        order = np.random.default_rng((split.seed, number)).permutation(names)
+        found.append(indices[np.isin(unit, order[: max(1, round(share * names.size))])])
+    return found[0], found[1]
+
+
 def _counts(total: int, shares: Mapping[str, float]) -> dict[str, int]:
     """Whole numbers that add up to ``total``, by largest remainder; none is 0 if that can be."""
     exact = {role: total * share / sum(shares.values()) for role, share in shares.items()}

@@ -35,7 +35,7 @@ from cvo_export.heads.base import Examples, L, Learner
 from cvo_export.methods import TRAINABLE
 from cvo_export.progress import Progress
 from cvo_export.run import History, PoseGraph, Run, TrainConfig, claim_run, open_run
-from cvo_export.splits import Split, deal_folds, make_split
+from cvo_export.splits import deal_folds, make_split, training_frames
 from cvo_export.target import Target, fit_target
 
 Array = NDArray[np.float64]
@@ -74,7 +74,8 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     torch.manual_seed(config.seed)
     backbone = Backbone(config.backbone, config.height, config.width)
     weights_sha256 = load_weights(backbone, config.weights)
-    indices = _training_frames(split)
+    parts = training_frames(dataset, split, config.share)
+    indices = np.concatenate(parts)
     target = fit_target(dataset.poses[indices])
     claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
@@ -94,7 +95,7 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
             ModelImages(dataset, split.roles["val"], *size),
             progress,
         ),
-        n_train=split.roles["train"].size,
+        n_train=parts[0].size,
         folds=partial(deal_folds, dataset, split, indices),
     )
     head = TRAINABLE[config.method].train(trainer, config.head)
@@ -111,7 +112,7 @@ def prepare_features(config: TrainConfig, cache: Path, progress: Progress) -> No
     """
     dataset = open_dataset(config.dataset)
     split = make_split(dataset, config.split, config.seed)
-    indices = _training_frames(split)
+    indices = np.concatenate(training_frames(dataset, split, config.share))
     backbone = Backbone(config.backbone, config.height, config.width)
     weights_sha256 = load_weights(backbone, config.weights)
     if weights_sha256 is None:
@@ -426,10 +427,6 @@ class _Lesson:
             ) from None
         self.history = [History(*entry) for entry in state["history"]]
         return state
-
-
-def _training_frames(split: Split) -> Indices:
-    return np.concatenate([split.roles["train"], split.roles["fit"]])
 
 
 def _shared_folder(

@@ -16,6 +16,8 @@ from cvo_edge.errors import CvoError, SinkError
 Task = Callable[[], None]
 # Name of a task that has ended, and what went wrong.
 Ended = Callable[[str, CvoError | None], None]
+# Runs all tasks, each once.
+Engine = Callable[[Mapping[str, Task], Ended], None]
 
 
 # A call into a library ends before a process can unwind.
@@ -26,7 +28,7 @@ class TaskError(CvoError):
     """A task ended by a defect, or its process was killed."""
 
 
-def run_tasks(tasks: Mapping[str, Task], jobs: int, ended: Ended) -> None:
+def run_tasks(jobs: int, tasks: Mapping[str, Task], ended: Ended) -> None:
     """Run tasks by name, ``jobs`` at a time; one that fails does not keep the others from running.
 
     A single one at a time runs in this process. Tasks are sent to processes, so they must pickle.
@@ -36,7 +38,7 @@ def run_tasks(tasks: Mapping[str, Task], jobs: int, ended: Ended) -> None:
         _in_processes(tasks, jobs, ended)
     else:
         for name, task in tasks.items():
-            ended(name, _attempt(task))
+            ended(name, attempt(task))
 
 
 def _in_processes(tasks: Mapping[str, Task], jobs: int, ended: Ended) -> None:
@@ -95,10 +97,10 @@ def _worker(sender: Connection, task: Task) -> None:
     # Unwind, so that half of a bundle or a semaphore is not left behind.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     torch.set_num_threads(1)
-    sender.send(_attempt(task))
+    sender.send(attempt(task))
 
 
-def _attempt(task: Task) -> CvoError | None:
+def attempt(task: Task) -> CvoError | None:
     """Run a task; returns what went wrong."""
     try:
         task()

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from cvo_edge.errors import CvoError, SinkError, UsageError
-from cvo_export import compare as comparing
+from cvo_export import cells, frame_times
 from cvo_export.backbone import Backbone, BackboneConfig
 from cvo_export.cli import app
 from cvo_export.compare import compare
@@ -142,8 +142,9 @@ def test_the_report_holds_every_figure_and_no_path(compared, options):
 def test_a_finished_comparison_trains_and_times_nothing(copied, compared, options, monkeypatch):
     shutil.rmtree(copied / "runs")
     shutil.rmtree(copied / "features")
-    for name in ("train", "prepare_features", "_frame_ms"):
-        monkeypatch.setattr(comparing, name, None)
+    for name in ("train", "prepare_features"):
+        monkeypatch.setattr(cells, name, None)
+    monkeypatch.setattr(frame_times, "frame_ms", None)
     lines, said = compared_again(copied, options, jobs=2)
     assert lines == compared[1]
     assert said == []
@@ -211,7 +212,7 @@ def test_bundles_are_timed_again_when_one_has_changed(copied, options, monkeypat
         timed.append(sorted(folder.name for folder in bundles.values()))
         return {method: {"p50": 1.25, "p95": 2.5} for method in bundles}
 
-    monkeypatch.setattr(comparing, "_frame_ms", frame_ms)
+    monkeypatch.setattr(frame_times, "frame_ms", frame_ms)
     for _ in range(2):
         lines, _ = compared_again(copied, options)
         assert sum("1.25 (2.50)" in line for line in lines) == 2

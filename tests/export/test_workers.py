@@ -25,7 +25,7 @@ def test_a_failure_keeps_its_kind_and_the_other_tasks_run(tmp_path, jobs, capfd)
         "again": partial(Path.touch, tmp_path / "second"),
     }
     found = {}
-    run_tasks(tasks, jobs, found.__setitem__)
+    run_tasks(jobs, tasks, found.__setitem__)
     assert found.keys() == tasks.keys()
     assert found["touch"] is None
     assert found["again"] is None
@@ -42,7 +42,7 @@ def test_a_failure_keeps_its_kind_and_the_other_tasks_run(tmp_path, jobs, capfd)
 def test_a_process_that_dies_is_a_failure_of_its_task(tmp_path):
     found = {}
     tasks = {"dies": partial(os._exit, 3), "lives": partial(Path.touch, tmp_path / "file")}
-    run_tasks(tasks, 2, found.__setitem__)
+    run_tasks(2, tasks, found.__setitem__)
     assert str(found["dies"]) == "its process ended with exit code 3"
     assert found["lives"] is None
 
@@ -76,7 +76,7 @@ def test_no_process_is_left_behind_by_a_signal(tmp_path, number):
         "from cvo_export.workers import run_tasks\n"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))\n"
         f"tasks = {{name: partial(exec, {sleep!r}) for name in 'abc'}}\n"
-        "run_tasks(tasks, 2, lambda *_: None)"
+        "run_tasks(2, tasks, lambda *_: None)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     try:

@@ -1,0 +1,255 @@
+"""A study: grids of methods, backbones, data, noise, options and seeds; every cell once.
+
+The configuration is TOML, a list of grids; see ``Grid``. Cells that two grids have in common are
+run once. All are kept in one folder, so that an interrupted study goes on, and so that a study that
+has grown runs what is new.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta, Struct
+
+from cvo_edge.errors import UsageError
+from cvo_export.bundle import versions
+from cvo_export.cells import CONFIDENCE, Cell, CellFolder, Say
+from cvo_export.configure import configure
+from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.files import write_json
+from cvo_export.frame_times import Timing, timed
+from cvo_export.noise import parse_noise
+from cvo_export.progress import Progress
+from cvo_export.run import TrainConfig
+from cvo_export.splits import Kind, default_kind
+from cvo_export.workers import Engine
+
+RESULTS_FILE = "results.json"
+
+Value = str | int | float
+# Options of the backbone and of the data; all others are the method's own.
+_OF_THE_NETWORK = ("stages", "grid", "share")
+
+
+class Grid(Struct, frozen=True, forbid_unknown_fields=True):
+    """All combinations of its lists.
+
+    Attributes
+    ----------
+    name
+        Of the grid, in the report.
+    data
+        ``FORMAT:PATH`` each; ``$NAME`` and ``${NAME}`` stand for variables of the environment.
+    split
+        One for all data; by default ``sequence`` where there are five or more, else ``block``.
+    methods, backbones
+        Names.
+    weights
+        ``timm``, ``none`` or a file, as for ``train``; variables as in ``data``.
+    seeds
+        How many, from 0 on.
+    noises
+        ``NAME`` or ``NAME:STRENGTH`` each; every cell is also evaluated on test frames with each.
+    vary
+        Option -> its values: ``stages``, ``grid``, ``share`` (of the training frames) or one of the
+        methods'.
+    size, stages, grid, copies, steps, fine_tune
+        As for ``train``.
+    """
+
+    name: Annotated[str, Meta(min_length=1)]
+    data: Annotated[list[str], Meta(min_length=1)]
+    methods: Annotated[list[str], Meta(min_length=1)]
+    split: Kind | None = None
+    backbones: Annotated[list[str], Meta(min_length=1)] = msgspec.field(
+        default_factory=lambda: ["mobilenetv2_100"]
+    )
+    weights: str = "timm"
+    seeds: Annotated[int, Meta(ge=1)] = 3
+    noises: list[str] = []
+    vary: dict[str, Annotated[list[Value], Meta(min_length=1)]] = {}
+    size: str = "256x192"
+    stages: str = "16"
+    grid: str = "3x4"
+    copies: Annotated[int, Meta(ge=0)] | None = None
+    steps: Annotated[int, Meta(ge=1)] | None = None
+    fine_tune: Annotated[int, Meta(ge=0)] | None = None
+
+
+class Study(Struct, frozen=True, forbid_unknown_fields=True):
+    """A configuration file."""
+
+    title: str
+    grids: Annotated[list[Grid], Meta(min_length=1)]
+
+
+class Place(Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a cell stands in a grid; ``varied`` holds the values of the options that vary."""
+
+    grid: str
+    cell: str
+    data: str
+    split: Kind
+    backbone: str
+    method: str
+    seed: int
+    varied: dict[str, Value]
+
+
+class Results(Struct, frozen=True, forbid_unknown_fields=True):
+    """What ``results.json`` holds: no path, and nothing that depends on where cells were run.
+
+    ``timing`` by name of the grid, of its first data set; milliseconds by cell.
+    """
+
+    title: str
+    confidence: float
+    study: Study
+    places: list[Place]
+    cells: dict[str, Cell]
+    timing: dict[str, Timing]
+    versions: dict[str, str]
+
+
+class _Plan(Struct):
+    """The cells of a study by name: their configurations and the noises each is evaluated with."""
+
+    places: list[Place]
+    configs: dict[str, TrainConfig]
+    noises: dict[str, list[str]]
+
+
+def read_study(path: Path) -> Study:
+    """Read a configuration; raises UsageError where it is none."""
+    try:
+        return msgspec.convert(tomllib.loads(path.read_text("utf-8")), Study)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+        raise UsageError(f"{path}: expected a study, found {error}") from None
+
+
+def run_study(
+    study: Study, folder: CellFolder, engine: Engine, progress: Progress, say: Say
+) -> Results:
+    """Run the cells that are missing, time what is to be timed, and write ``results.json``.
+
+    Raises UsageError for a grid that cannot be, before anything is run; else as ``CellFolder.fill``
+    does, after all other cells have been run.
+    """
+    opened = {text: open_dataset(expanded(text)) for grid in study.grids for text in grid.data}
+    plan = _plan(study, opened)
+    cells = folder.fill(plan.configs, plan.noises, engine, progress, say)
+    results = Results(
+        title=study.title,
+        confidence=CONFIDENCE,
+        study=study,
+        places=plan.places,
+        cells=cells,
+        timing={
+            grid.name: _timing(grid, plan.places, cells, folder, opened[grid.data[0]])
+            for grid in study.grids
+            if not grid.vary
+        },
+        versions=versions(("cvo-edge", "cvo-export", "torch", "timm", "onnx", "scikit-learn")),
+    )
+    write_json(folder.out / RESULTS_FILE, results)
+    return results
+
+
+def expanded(text: str) -> str:
+    """Replace variables of the environment; raises UsageError where one is not set."""
+    found = os.path.expandvars(text)
+    if (unset := re.search(r"\$\{?(\w+)", found)) is not None:
+        raise UsageError(f"study: expected the variable {unset[1]} to be set, found {text!r}")
+    return found
+
+
+def _plan(study: Study, opened: Mapping[str, PoseDataset]) -> _Plan:
+    plan = _Plan([], {}, {})
+    names = [grid.name for grid in study.grids]
+    if len(set(names)) < len(names):
+        raise UsageError(f"study: expected a name of its own for every grid, found {names}")
+    for grid in study.grids:
+        noises = [str(parse_noise(text)) for text in grid.noises]
+        combinations = [dict(zip(grid.vary, v, strict=True)) for v in product(*grid.vary.values())]
+        for data, backbone, method, varied, seed in product(
+            grid.data, grid.backbones, grid.methods, combinations, range(grid.seeds)
+        ):
+            dataset = opened[data]
+            split = grid.split or default_kind(dataset)
+            config = _config(grid, data, split, backbone, method, varied, seed)
+            name = _cell_name(config, data, grid.weights, dataset.name)
+            plan.configs[name] = config
+            known = plan.noises.setdefault(name, [])
+            known += [noise for noise in noises if noise not in known]
+            plan.places.append(
+                Place(grid.name, name, dataset.name, split, backbone, method, seed, varied)
+            )
+    return plan
+
+
+def _config(
+    grid: Grid,
+    data: str,
+    split: Kind,
+    backbone: str,
+    method: str,
+    varied: Mapping[str, Value],
+    seed: int,
+) -> TrainConfig:
+    network: dict[str, Any] = {"stages": grid.stages, "grid": grid.grid, "share": None}
+    network |= {key: value for key, value in varied.items() if key in _OF_THE_NETWORK}
+    return configure(
+        method=method,
+        dataset=expanded(data),
+        split=split,
+        seed=seed,
+        size=grid.size,
+        crop="none",
+        backbone=backbone,
+        weights=expanded(grid.weights),
+        normalisation=None,
+        head={key: value for key, value in varied.items() if key not in _OF_THE_NETWORK},
+        copies=grid.copies,
+        steps=grid.steps,
+        fine_tune=grid.fine_tune,
+        **network,
+    )
+
+
+def _cell_name(config: TrainConfig, data: str, weights: str, dataset_name: str) -> str:
+    """Name of a cell, the same wherever its data and weights are."""
+    decisive = {**msgspec.to_builtins(config), "dataset": data, "weights": weights}
+    digest = hashlib.sha256(msgspec.json.encode(decisive)).hexdigest()[:8]
+    words = (dataset_name, config.split, config.backbone.name, config.method, str(config.seed))
+    return "-".join(_file_safe(word) for word in (*words, digest))
+
+
+def _timing(
+    grid: Grid,
+    places: list[Place],
+    cells: Mapping[str, Cell],
+    folder: CellFolder,
+    dataset: PoseDataset,
+) -> Timing:
+    """Time the bundles of seed 0 of a grid on its first data set."""
+    names = [
+        place.cell
+        for place in places
+        if (place.grid, place.data, place.seed) == (grid.name, dataset.name, 0)
+    ]
+    bundles = {name: (cells[name].bundle, folder.bundle(name)) for name in names}
+    return timed(folder.out / f"timing-{_file_safe(grid.name)}.json", bundles, dataset)
+
+
+def _file_safe(text: str) -> str:
+    return re.sub(r"[^\w.]+", "_", text)

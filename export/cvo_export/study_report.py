@@ -1,0 +1,400 @@
+"""The report of a study: one page of HTML with everything in it, and its pictures as files."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from cvo_edge.errors import UsageError
+from cvo_export.cells import Cell, CellFolder, Figures
+from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.files import write_whole
+from cvo_export.noise import noisy, parse_noise
+from cvo_export.splits import make_split
+from cvo_export.study import Grid, Place, Results, Value, expanded
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+REPORT_FILE, PICTURES_FOLDER = "report.html", "pictures"
+
+# Of the tube, which is drawn for one method.
+_TUBE_METHOD = "cjp"
+_DPI = 110
+
+
+class Table(NamedTuple):
+    """A table of the report: text alone."""
+
+    caption: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+class Picture(NamedTuple):
+    """A picture of the report, and what it shows; ``source`` is the file as a data URL."""
+
+    caption: str
+    source: str
+
+
+class Section(NamedTuple):
+    """A grid of the report."""
+
+    title: str
+    text: str
+    tables: Sequence[Table]
+    pictures: Sequence[Picture]
+
+
+def write_report(results: Results, folder: CellFolder) -> Path:
+    """Write ``report.html`` and the pictures; returns the page.
+
+    Raises UsageError where matplotlib or jinja2 is not installed, SinkError where nothing can be
+    written.
+    """
+    try:
+        import matplotlib  # noqa: F401
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError as error:
+        raise UsageError(
+            f'study: expected {error.name}, found none; pip install "cvo-export[plot]"'
+        ) from None
+    report = _Report(results, folder)
+    environment = Environment(
+        loader=PackageLoader("cvo_export"), autoescape=True, undefined=StrictUndefined
+    )
+    page = environment.get_template(REPORT_FILE).render(
+        title=results.title,
+        confidence=results.confidence,
+        versions=results.versions,
+        cells=len(results.cells),
+        first=[report.table_one(grid) for grid in results.study.grids if not grid.vary],
+        sections=[report.section(grid) for grid in results.study.grids],
+    )
+    path = folder.out / REPORT_FILE
+    write_whole(path, page)
+    return path
+
+
+class _Report:
+    """Tables and pictures of the grids of a study."""
+
+    def __init__(self, results: Results, folder: CellFolder) -> None:
+        self.results = results
+        self.folder = folder
+        self._opened: dict[str, PoseDataset] = {}
+
+    def section(self, grid: Grid) -> Section:
+        """Return all that one grid has to show."""
+        tables, pictures = [], []
+        for data in dict.fromkeys(place.data for place in self.places(grid)):
+            places = [place for place in self.places(grid) if place.data == data]
+            split = places[0].split
+            title = f"{data}, {split} split"
+            if grid.vary:
+                tables.append(self.figures_table(title, places, tuple(grid.vary)))
+                pictures += self.curves(grid, title, places)
+            else:
+                tables.append(self.figures_table(title, places, ()))
+                tables += [self.noise_table(title, places)] if grid.noises else []
+        if not grid.vary:
+            pictures += self.sets(grid)
+        seeds = "one seed" if grid.seeds == 1 else f"{grid.seeds} seeds: medians, each in brackets"
+        return Section(grid.name, f"{seeds}; weights {_source(grid.weights)}", tables, pictures)
+
+    def places(self, grid: Grid) -> list[Place]:
+        """Return the cells' places in a grid."""
+        return [place for place in self.results.places if place.grid == grid.name]
+
+    def cell(self, place: Place) -> Cell:
+        """Return the figures of a place."""
+        return self.results.cells[place.cell]
+
+    # -- tables -----------------------------------------------------------------------------------
+
+    def figures_table(self, title: str, places: Sequence[Place], varied: Sequence[str]) -> Table:
+        """Return a line for each backbone, method and value of the options that vary."""
+        head = [
+            *("backbone", "method", *varied),
+            *("coverage", "all six", "joint scope", "width", "score", "own coverage", "own score"),
+            *("point error", "width hard/easy", "rank corr.", "train s", "M param.", "ms"),
+        ]
+        rows = []
+        for key, of_key in _grouped(places, lambda p: (p.backbone, p.method, *p.varied.values())):
+            cells = [self.cell(place) for place in of_key]
+            own = [cell.own for cell in cells if cell.own is not None]
+            rows.append(
+                [
+                    *map(str, key),
+                    *_shown([cell.marginal for cell in cells])[:2],
+                    f"{_median(cell.joint.joint_coverage for cell in cells):.3f}",
+                    *_shown([cell.marginal for cell in cells])[2:],
+                    f"{_median(figures.mean_coverage for figures in own):.3f}" if own else "-",
+                    f"{_median(figures.normalised_interval_score for figures in own):.3f}"
+                    if own
+                    else "-",
+                    _error([cell.point_error for cell in cells]),
+                    _adaptiveness(cells, "width_ratio"),
+                    _adaptiveness(cells, "rank_correlation"),
+                    _seconds(cells),
+                    f"{cells[0].graph_parameters / 1e6:.2f}",
+                    self.milliseconds(of_key),
+                ]
+            )
+        return Table(title, head, rows)
+
+    def noise_table(self, title: str, places: Sequence[Place]) -> Table:
+        """Return a line for each backbone, method and noise: both policies beside clean frames."""
+        head = [
+            *("backbone", "method", "noise", "point error"),
+            *("thresholds of clean frames: coverage", "all six", "width", "score"),
+            *("recalibrated: coverage", "all six", "width", "score"),
+        ]
+        rows = []
+        for (backbone, method), of_key in _grouped(places, lambda p: (p.backbone, p.method)):
+            cells = [self.cell(place) for place in of_key]
+            clean = _shown([cell.marginal for cell in cells])
+            error = _error([cell.point_error for cell in cells])
+            rows.append([backbone, method, "none", error, *clean, *clean])
+            for name in cells[0].noise:
+                noise = [cell.noise[name] for cell in cells]
+                rows.append(
+                    [
+                        *(backbone, method, name, _error([found.point_error for found in noise])),
+                        *_shown([found.clean for found in noise]),
+                        *_shown([found.recalibrated for found in noise]),
+                    ]
+                )
+        return Table(f"{title}, with noise", head, rows)
+
+    def table_one(self, grid: Grid) -> Table:
+        """Return the paper's Table I with numbers, of a grid's first data set and backbone."""
+        first = self.places(grid)[0]
+        places = [
+            place
+            for place in self.places(grid)
+            if (place.data, place.backbone) == (first.data, first.backbone)
+        ]
+        columns = _grouped(places, lambda place: (place.method,))
+        cells = {key[0]: [self.cell(place) for place in found] for key, found in columns}
+        shares = self.by_share(first)
+        joint_sets = {"mcqr": "six at once, a region"}
+
+        def row(name: str, figure: Callable[[str], str]) -> list[str]:
+            return [name, *(figure(method) for method in cells)]
+
+        ms = {method: self.milliseconds(found) for (method,), found in columns}
+        return Table(
+            f"Table I with numbers: {first.data}, {first.split} split, {first.backbone}",
+            ["", *cells],
+            [
+                row(
+                    "uncertainty bands: the network's sets",
+                    lambda m: joint_sets.get(m, "each degree of freedom"),
+                ),
+                row("disjoint bands: share of sets in pieces", lambda m: _pieces(cells[m])),
+                row("complexity: ms a frame", lambda m: ms[m]),
+                row(
+                    "complexity: millions of parameters",
+                    lambda m: f"{cells[m][0].graph_parameters / 1e6:.2f}",
+                ),
+                row(
+                    "interval calibration: own coverage over lambda 0 to 1",
+                    lambda m: self.tunable(first, m),
+                ),
+                row(
+                    "interval adaptiveness: width on frames of large over small errors",
+                    lambda m: _adaptiveness(cells[m], "width_ratio"),
+                ),
+                row(
+                    "uncertainty accuracy: rank correlation of width and error",
+                    lambda m: _adaptiveness(cells[m], "rank_correlation"),
+                ),
+                row(
+                    "uncertainty accuracy: interval score",
+                    lambda m: _shown([cell.marginal for cell in cells[m]])[3],
+                ),
+                row("training time: processor seconds", lambda m: _seconds(cells[m])),
+                row(
+                    "data dependency: score at "
+                    + ", ".join(f"{100 * share:g} %" for share in shares),
+                    lambda m: ", ".join(shares[share].get(m, "-") for share in shares) or "-",
+                ),
+            ],
+        )
+
+    def by_share(self, first: Place) -> dict[float, dict[str, str]]:
+        """Share of the training frames -> method -> score, on the data of a place."""
+        found: dict[float, dict[str, str]] = {}
+        for grid in self.results.study.grids:
+            if set(grid.vary) == {"share"}:
+                places = [p for p in self.places(grid) if p.data == first.data]
+                for (share, method), group in _grouped(
+                    places, lambda p: (p.varied["share"], p.method)
+                ):
+                    scores = [self.cell(p).marginal.normalised_interval_score for p in group]
+                    found.setdefault(float(share), {})[str(method)] = f"{_median(scores):.3f}"
+        return dict(sorted(found.items()))
+
+    def tunable(self, first: Place, method: str) -> str:
+        """Range of the own bounds' coverage over lambda; the others have nothing to tune."""
+        coverages = [
+            cell.own.mean_coverage
+            for place in self.results.places
+            if (place.data, place.method) == (first.data, method) and "sharpness" in place.varied
+            if (cell := self.cell(place)).own is not None
+        ]
+        return f"{min(coverages):.2f} to {max(coverages):.2f}" if coverages else "-"
+
+    def milliseconds(self, places: Sequence[Place]) -> str:
+        """Median of a frame, of the cell that was timed."""
+        timings = [timing.ms for timing in self.results.timing.values()]
+        found = [ms[place.cell]["p50"] for place in places for ms in timings if place.cell in ms]
+        return f"{found[0]:.2f}" if found else "-"
+
+    # -- pictures ---------------------------------------------------------------------------------
+
+    def sets(self, grid: Grid) -> list[Picture]:
+        """Return the sets of all methods, and the tube under each noise, seed 0."""
+        from cvo_export.plot import track
+        from cvo_export.study_figures import comparison, tube
+
+        places = [place for place in self.places(grid) if place.seed == 0]
+        pictures = []
+        for (data, backbone), of_key in _grouped(places, lambda p: (p.data, p.backbone)):
+            dataset = self.dataset(grid, str(data))
+            bundles = {place.method: self.folder.bundle(place.cell) for place in of_key}
+            first = _first_sequence(of_key[0], dataset)
+            drawn = {m: track(bundle, dataset, sequence=first) for m, bundle in bundles.items()}
+            pictures.append(
+                self.picture(
+                    comparison(drawn),
+                    f"{data}, {backbone}: sets of x over test frames, and of x and y, 0.9 marginal",
+                )
+            )
+            if _TUBE_METHOD not in bundles or not grid.noises:
+                continue
+            tracks = {"none": drawn[_TUBE_METHOD]}
+            for noise in map(parse_noise, grid.noises):
+                worse = noisy(dataset, noise, of_key[0].seed)
+                tracks[noise.name] = track(bundles[_TUBE_METHOD], worse, sequence=first)
+            caption = f"{data}, {backbone}, {_TUBE_METHOD}: boxes of x, y and z under noise"
+            pictures.append(self.picture(tube(tracks), caption + ", thresholds of clean frames"))
+        return pictures
+
+    def curves(self, grid: Grid, title: str, places: Sequence[Place]) -> list[Picture]:
+        """Return one picture: the first option that varies along x, lines for the rest."""
+        from cvo_export.study_figures import curves
+
+        option = next(iter(grid.vary))
+        values: list[Value] = grid.vary[option]
+        panels: dict[str, dict[str, list[float]]] = {
+            "coverage, own bounds": {},
+            "coverage, calibrated": {},
+            "score": {},
+            "mean width (cm)": {},
+        }
+        for key, of_key in _grouped(
+            places,
+            lambda p: (p.method, *(v for k, v in p.varied.items() if k != option)),
+        ):
+            label = " ".join(map(str, key))
+            for value in values:
+                cells = [self.cell(p) for p in of_key if p.varied[option] == value]
+                own = [cell.own.mean_coverage for cell in cells if cell.own is not None]
+                found = (
+                    _median(own) if own else float("nan"),
+                    _median(cell.marginal.mean_coverage for cell in cells),
+                    _median(cell.marginal.normalised_interval_score for cell in cells),
+                    100 * _median(cell.marginal.mean_width.m for cell in cells),
+                )
+                for panel, figure in zip(panels.values(), found, strict=True):
+                    panel.setdefault(label, []).append(figure)
+        drawn = {
+            name: lines for name, lines in panels.items() if np.isfinite([*lines.values()]).any()
+        }
+        return [self.picture(curves(option, values, drawn), f"{title}: {option}")]
+
+    def picture(self, figure: Figure, caption: str) -> Picture:
+        """Write a picture as a file, and return it for the page."""
+        stream = BytesIO()
+        figure.savefig(stream, format="png", dpi=_DPI)
+        content = stream.getvalue()
+        name = re.sub(r"[^\w.]+", "-", caption.split(": sets")[0].split(": boxes")[0]).lower()
+        kind = "sets" if ": sets" in caption else "tube" if ": boxes" in caption else "curve"
+        write_whole(self.folder.out / PICTURES_FOLDER / f"{kind}-{name}.png", content)
+        return Picture(caption, "data:image/png;base64," + base64.b64encode(content).decode())
+
+    def dataset(self, grid: Grid, name: str) -> PoseDataset:
+        """Return the data set of this name, opened once."""
+        for text in grid.data:
+            if text not in self._opened:
+                self._opened[text] = open_dataset(expanded(text))
+        return next(self._opened[text] for text in grid.data if self._opened[text].name == name)
+
+
+def _grouped(
+    places: Iterable[Place], key: Callable[[Place], tuple[Any, ...]]
+) -> list[tuple[tuple[Any, ...], list[Place]]]:
+    groups: dict[tuple[Any, ...], list[Place]] = {}
+    for place in places:
+        groups.setdefault(key(place), []).append(place)
+    return list(groups.items())
+
+
+def _first_sequence(place: Place, dataset: PoseDataset) -> str:
+    """Name of the first sequence that has test frames."""
+    test = make_split(dataset, place.split, place.seed).roles["test"]
+    name: str = dataset.sequence_names[int(dataset.sequence[test[0]])]
+    return name
+
+
+def _shown(figures: Sequence[Figures]) -> tuple[str, str, str, str]:
+    """Coverage, coverage of all six, mean width and score with each seed's."""
+    scores = [entry.normalised_interval_score for entry in figures]
+    each = f" ({', '.join(f'{score:.3f}' for score in scores)})" if len(scores) > 1 else ""
+    return (
+        f"{_median(entry.mean_coverage for entry in figures):.3f}",
+        f"{_median(entry.joint_coverage for entry in figures):.3f}",
+        f"{100 * _median(entry.mean_width.m for entry in figures):.1f} cm "
+        f"{_median(entry.mean_width.deg for entry in figures):.2f} deg",
+        f"{_median(scores):.3f}{each}",
+    )
+
+
+def _error(errors: Sequence[Mapping[str, float]]) -> str:
+    return (
+        f"{100 * _median(error['median_m'] for error in errors):.2f} cm "
+        f"{_median(error['median_deg'] for error in errors):.2f} deg"
+    )
+
+
+def _adaptiveness(cells: Sequence[Cell], key: str) -> str:
+    found = [value for cell in cells if (value := cell.adaptiveness[key]) is not None]
+    return f"{_median(found):.2f}" if found else "-"
+
+
+def _pieces(cells: Sequence[Cell]) -> str:
+    found = [cell.pieces for cell in cells if cell.pieces is not None]
+    return f"{100 * _median(found):.1f} %" if found else "none"
+
+
+def _seconds(cells: Sequence[Cell]) -> str:
+    found = [cell.training.processor for cell in cells if cell.training is not None]
+    return f"{_median(found):.0f}" if found else "-"
+
+
+def _median(values: Iterable[float]) -> float:
+    return float(np.median(list(values)))
+
+
+def _source(weights: str) -> str:
+    """What a reader may know of weights: never a path."""
+    return weights if weights in ("timm", "none") else "of a file"

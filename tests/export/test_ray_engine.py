@@ -1,0 +1,72 @@
+"""The Ray engine: the same outcomes as processes of this machine, and what a lost worker costs."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from cvo_edge.errors import UsageError
+from cvo_export.ray_engine import run_tasks_on_ray
+
+pytest.importorskip("ray")
+
+# The script beside the interpreter: of this very environment.
+RAY = Path(sys.executable).with_name("ray")
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    """A cluster of this machine alone, at an address of its own, ended afterwards."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{found.getsockname()[1]}"
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    options = [f"--port={address.split(':')[1]}", "--node-ip-address=127.0.0.1", "--num-cpus=2"]
+    quiet = ["--include-dashboard=false", "--disable-usage-stats"]
+    command = [RAY, "start", "--head", "--block", *options, *quiet]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as head:
+        try:
+            health = [RAY, "health-check", "--address", address]
+            while subprocess.run(health, check=False, capture_output=True).returncode != 0:
+                assert head.poll() is None
+            yield
+        finally:
+            head.terminate()
+
+
+def write(path, text):
+    path.write_text(text)
+
+
+def refuse():
+    raise UsageError("no")
+
+
+def die_once(path):
+    """End this process the hard way the first time, succeed the second."""
+    if not path.exists():
+        path.write_text("once")
+        os.kill(os.getpid(), signal.SIGKILL)
+    path.write_text("twice")
+
+
+def test_outcomes_are_those_of_the_tasks_and_a_killed_worker_is_run_again(cluster, tmp_path):
+    tasks = {
+        "write": partial(write, tmp_path / "written", "by a worker"),
+        "refuse": refuse,
+        "die": partial(die_once, tmp_path / "died"),
+    }
+    found = {}
+    run_tasks_on_ray(tasks, found.__setitem__)
+    assert set(found) == set(tasks)
+    assert found["write"] is None
+    assert (tmp_path / "written").read_text() == "by a worker"
+    assert type(found["refuse"]) is UsageError
+    assert str(found["refuse"]) == "no"
+    assert found["die"] is None
+    assert (tmp_path / "died").read_text() == "twice"

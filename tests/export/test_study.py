@@ -1,0 +1,209 @@
+"""A study: every cell once, the same wherever its files are, and a page that needs no other."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from cvo_edge.errors import UsageError
+from cvo_export import cells
+from cvo_export.cells import CellFolder
+from cvo_export.cli import app
+from cvo_export.datasets import open_dataset
+from cvo_export.evaluate import evaluate, find_level
+from cvo_export.noise import parse_noise
+from cvo_export.splits import make_split, training_frames
+from cvo_export.study import Study, expanded, read_study, run_study
+from cvo_export.study_report import write_report
+from cvo_export.workers import run_tasks
+
+from .conftest import DATASET, ignore_progress
+
+GRID = """
+[[grids]]
+data = ["$CVO_TEST_DATA"]
+split = "random"
+methods = ["cjp"]
+weights = "none"
+size = "64x48"
+copies = 1
+steps = 100
+"""
+CONFIG = f"""
+title = "Tiny <study>"
+{GRID}
+name = "methods"
+seeds = 2
+noises = ["speckle:0.3"]
+{GRID}
+name = "sharpness"
+seeds = 1
+vary = {{ sharpness = [0.5, 1.0] }}
+"""
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    """Folder, results and page of a study, and what was said of its cells."""
+    folder = tmp_path_factory.mktemp("study")
+    (folder / "study.toml").write_text(CONFIG)
+    said = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CVO_TEST_DATA", DATASET)
+        study = read_study(folder / "study.toml")
+        cell_folder = CellFolder(folder / "out", folder / "out" / "features")
+        results = run_study(study, cell_folder, engine, ignore_progress, said.append)
+        page = write_report(results, cell_folder)
+    return cell_folder, study, results, page, said
+
+
+def engine(tasks, ended):
+    run_tasks(1, tasks, ended)
+
+
+def test_a_cell_of_two_grids_is_run_once(studied):
+    folder, _, results, _, said = studied
+    # Sharpness 0.5 is what seed 0 of the first grid has anyway.
+    assert len(said) == len(results.cells) == len(list((folder.out / "cells").iterdir())) == 3
+    assert len(results.places) == 4
+    first, _, default, other = results.places
+    assert (first.cell, default.varied) == (default.cell, {"sharpness": 0.5})
+    assert other.cell != default.cell
+    assert other.varied == {"sharpness": 1.0}
+
+
+def test_a_finished_study_runs_nothing(studied, monkeypatch):
+    folder, study, results, _, _ = studied
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET)
+    monkeypatch.setattr(cells, "train", None)
+    monkeypatch.setattr(cells, "evaluate", None)
+    said = []
+    again = run_study(study, folder, engine, ignore_progress, said.append)
+    assert said == []
+    assert again == results
+
+
+def test_a_noise_that_is_new_is_evaluated_without_training(studied, monkeypatch, tmp_path):
+    known, _, results, _, _ = studied
+    folder = CellFolder(shutil.copytree(known.out, tmp_path / "out"), known.features)
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET)
+    name = results.places[1].cell
+    before = folder.cell(name).read_bytes()
+    monkeypatch.setattr(cells, "train", None)
+    text = CONFIG.replace('["speckle:0.3"]', '["speckle:0.3", "exposure"]').replace(
+        "seeds = 2", "seeds = 1"
+    )
+    (tmp_path / "study.toml").write_text(text)
+    grown = run_study(
+        read_study(tmp_path / "study.toml"), folder, engine, ignore_progress, [].append
+    )
+    assert set(grown.cells[results.places[0].cell].noise) == {"speckle:0.3", "exposure:-2.0"}
+    assert folder.cell(name).read_bytes() == before
+
+
+def test_a_cell_holds_what_evaluate_says_of_its_bundle(studied):
+    folder, _, results, _, _ = studied
+    place = results.places[1]
+    found, dataset = results.cells[place.cell], open_dataset(DATASET)
+    report = evaluate(folder.bundle(place.cell), dataset, "test")
+    marginal = find_level(report["levels"], 0.9, "marginal")
+    assert found.marginal.coverage == marginal["coverage"]
+    assert found.adaptiveness == marginal["adaptiveness"]
+    noise = parse_noise("speckle:0.3")
+    noisy = evaluate(folder.bundle(place.cell), dataset, "test", noise=noise)
+    figures = found.noise[str(noise)]
+    for level, kept in ((noisy, figures.clean), (noisy["recalibrated"], figures.recalibrated)):
+        assert find_level(level["levels"], 0.9, "marginal")["coverage"] == kept.coverage
+    assert figures.point_error == noisy["point_error"]
+
+
+def test_results_hold_no_path_and_a_page_needs_no_other_file(studied):
+    folder, _, results, page, _ = studied
+    text = (folder.out / "results.json").read_text()
+    html = page.read_text()
+    for written in (text, html):
+        assert str(folder.out.parent) not in written
+    assert json.loads(text)["cells"].keys() == results.cells.keys()
+    assert "Tiny &lt;study&gt;" in html
+    sources = re.findall(r'(?:src|href)="([^"]{0,30})', html)
+    assert sources
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    pictures = sorted(path.name.split("-")[0] for path in (folder.out / "pictures").iterdir())
+    assert pictures == ["curve", "sets", "tube"]
+    assert len(sources) == len(pictures)
+    score = results.cells[results.places[0].cell].marginal.normalised_interval_score
+    assert f"{score:.3f}" in html
+
+
+def test_names_of_cells_depend_on_no_place(studied, monkeypatch, tmp_path):
+    _, study, results, _, _ = studied
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET + ",seed=0")
+    names = []
+
+    def said_only(tasks, ended):
+        names.extend(tasks)
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        run_study(study, CellFolder(tmp_path, tmp_path), said_only, ignore_progress, [].append)
+    assert set(names) == set(results.cells)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("title = 1", "expected a study"),
+        (CONFIG.replace("steps", "stepz"), "unknown field `stepz`"),
+        (CONFIG.replace('"sharpness"', '"methods"'), "a name of its own for every grid"),
+        (CONFIG.replace("speckle:0.3", "rain"), "expected NAME or NAME:STRENGTH"),
+        (CONFIG.replace('["cjp"]', '["abc"]'), "expected one of cjp"),
+        (CONFIG.replace("sharpness = [0.5", "classes = [4"), "expected an option of cjp"),
+        (CONFIG.replace("CVO_TEST_DATA", "CVO_UNSET"), "CVO_UNSET to be set"),
+        ("grids = [", "expected a study"),
+    ],
+)
+def test_a_study_that_cannot_be_is_refused_before_anything(text, message, tmp_path, monkeypatch):
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET)
+    (tmp_path / "study.toml").write_text(text)
+    with pytest.raises(UsageError, match=message) as caught:
+        app(["study", str(tmp_path / "study.toml"), str(tmp_path / "out")], standalone_mode=False)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_configuration_is_said(tmp_path):
+    with pytest.raises(UsageError, match="cannot be read: No such file"):
+        read_study(tmp_path / "none.toml")
+
+
+def test_variables_are_replaced(monkeypatch):
+    monkeypatch.setenv("CVO_TEST_DATA", "place")
+    assert expanded("7scenes:$CVO_TEST_DATA/a") == expanded("7scenes:${CVO_TEST_DATA}/a")
+    assert expanded("7scenes:$CVO_TEST_DATA/a") == "7scenes:place/a"
+
+
+@pytest.mark.parametrize("kind", ["random", "block", "sequence"])
+def test_a_share_of_the_training_frames_is_a_part_of_a_larger_one(kind):
+    dataset = open_dataset("synthetic:room,flights=20,frames=40,size=64x48")
+    split = make_split(dataset, kind, 3)
+    everything = training_frames(dataset, split, 1.0)
+    half, quarter = (training_frames(dataset, split, share) for share in (0.5, 0.25))
+    for role, (all_of_it, larger, smaller) in enumerate(
+        zip(everything, half, quarter, strict=True)
+    ):
+        assert set(smaller) <= set(larger) <= set(all_of_it), role
+        assert 0 < smaller.size < larger.size < all_of_it.size or kind != "random"
+        assert (np.diff(larger) > 0).all()
+        if kind == "sequence":
+            used = np.unique(dataset.sequence[larger])
+            whole = all_of_it[np.isin(dataset.sequence[all_of_it], used)]
+            assert larger.tolist() == whole.tolist()
+
+
+def test_the_configurations_that_come_with_the_project_are_read(request, monkeypatch):
+    folder = request.config.rootpath / "bench" / "study"
+    found = [read_study(path) for path in sorted(folder.glob("*.toml"))]
+    assert len(found) == 2
+    assert all(isinstance(study, Study) for study in found)
