@@ -271,8 +271,8 @@ class _Report:
         for (data, backbone), of_key in _grouped(places, lambda p: (p.data, p.backbone)):
             dataset = self.dataset(grid, str(data))
             bundles = {place.method: self.folder.bundle(place.cell) for place in of_key}
-            first = _first_sequence(of_key[0], dataset)
-            drawn = {m: track(bundle, dataset, sequence=first) for m, bundle in bundles.items()}
+            shown = _sequence_shown(of_key[0], dataset)
+            drawn = {m: track(bundle, dataset, sequence=shown) for m, bundle in bundles.items()}
             pictures.append(
                 self.picture(
                     comparison(drawn),
@@ -284,7 +284,7 @@ class _Report:
             tracks = {"none": drawn[_TUBE_METHOD]}
             for noise in map(parse_noise, grid.noises):
                 worse = noisy(dataset, noise, of_key[0].seed)
-                tracks[noise.name] = track(bundles[_TUBE_METHOD], worse, sequence=first)
+                tracks[noise.name] = track(bundles[_TUBE_METHOD], worse, sequence=shown)
             caption = f"{data}, {backbone}, {_TUBE_METHOD}: boxes of x, y and z under noise"
             pictures.append(self.picture(tube(tracks), caption + ", thresholds of clean frames"))
         return pictures
@@ -349,10 +349,10 @@ def _grouped(
     return list(groups.items())
 
 
-def _first_sequence(place: Place, dataset: PoseDataset) -> str:
-    """Name of the first sequence that has test frames."""
+def _sequence_shown(place: Place, dataset: PoseDataset) -> str:
+    """Name of the sequence that has the most test frames."""
     test = make_split(dataset, place.split, place.seed).roles["test"]
-    name: str = dataset.sequence_names[int(dataset.sequence[test[0]])]
+    name: str = dataset.sequence_names[int(np.bincount(dataset.sequence[test]).argmax())]
     return name
 
 
