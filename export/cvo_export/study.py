@@ -92,7 +92,10 @@ class Study(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Place(Struct, frozen=True, forbid_unknown_fields=True):
-    """Where a cell stands in a grid; ``varied`` holds the values of the options that vary."""
+    """Where a cell stands in a grid.
+
+    ``data`` is a key of ``Results.data``; ``varied`` holds the values of the options that vary.
+    """
 
     grid: str
     cell: str
@@ -107,12 +110,14 @@ class Place(Struct, frozen=True, forbid_unknown_fields=True):
 class Results(Struct, frozen=True, forbid_unknown_fields=True):
     """What ``results.json`` holds: no path, and nothing that depends on where cells were run.
 
-    ``timing`` by name of the grid, of its first data set; milliseconds by cell.
+    ``data``: name of each data set -> as the configuration has it; two of one name are told apart
+    by all of it. ``timing`` by name of the grid, of its first data set; milliseconds by cell.
     """
 
     title: str
     confidence: float
     study: Study
+    data: dict[str, str]
     places: list[Place]
     cells: dict[str, Cell]
     timing: dict[str, Timing]
@@ -120,8 +125,12 @@ class Results(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Plan(Struct):
-    """The cells of a study by name: their configurations and the noises each is evaluated with."""
+    """The cells of a study by name: their configurations and the noises each is evaluated with.
 
+    ``labels`` of the data sets, by their text.
+    """
+
+    labels: dict[str, str]
     places: list[Place]
     configs: dict[str, TrainConfig]
     noises: dict[str, list[str]]
@@ -152,10 +161,11 @@ def run_study(
         title=study.title,
         confidence=CONFIDENCE,
         study=study,
+        data={label: text for text, label in plan.labels.items()},
         places=plan.places,
         cells=cells,
         timing={
-            grid.name: _timing(grid, plan.places, cells, folder, opened[grid.data[0]])
+            grid.name: _timing(grid, plan, cells, folder, opened[grid.data[0]])
             for grid in study.grids
             if not grid.vary
         },
@@ -174,7 +184,7 @@ def expanded(text: str) -> str:
 
 
 def _plan(study: Study, opened: Mapping[str, PoseDataset]) -> _Plan:
-    plan = _Plan([], {}, {})
+    plan = _Plan(_labels(opened), [], {}, {})
     names = [grid.name for grid in study.grids]
     if len(set(names)) < len(names):
         raise UsageError(f"study: expected a name of its own for every grid, found {names}")
@@ -192,9 +202,17 @@ def _plan(study: Study, opened: Mapping[str, PoseDataset]) -> _Plan:
             known = plan.noises.setdefault(name, [])
             known += [noise for noise in noises if noise not in known]
             plan.places.append(
-                Place(grid.name, name, dataset.name, split, backbone, method, seed, varied)
+                Place(grid.name, name, plan.labels[data], split, backbone, method, seed, varied)
             )
     return plan
+
+
+def _labels(opened: Mapping[str, PoseDataset]) -> dict[str, str]:
+    names = [dataset.name for dataset in opened.values()]
+    return {
+        text: dataset.name if names.count(dataset.name) == 1 else f"{dataset.name} ({text})"
+        for text, dataset in opened.items()
+    }
 
 
 def _config(
@@ -236,17 +254,14 @@ def _cell_name(config: TrainConfig, data: str, weights: str, dataset_name: str) 
 
 def _timing(
     grid: Grid,
-    places: list[Place],
+    plan: _Plan,
     cells: Mapping[str, Cell],
     folder: CellFolder,
     dataset: PoseDataset,
 ) -> Timing:
     """Time the bundles of seed 0 of a grid on its first data set."""
-    names = [
-        place.cell
-        for place in places
-        if (place.grid, place.data, place.seed) == (grid.name, dataset.name, 0)
-    ]
+    first = (grid.name, plan.labels[grid.data[0]], 0)
+    names = [p.cell for p in plan.places if (p.grid, p.data, p.seed) == first]
     bundles = {name: (cells[name].bundle, folder.bundle(name)) for name in names}
     return timed(folder.out / f"timing-{_file_safe(grid.name)}.json", bundles, dataset)
 

@@ -225,7 +225,7 @@ class _Report:
                 row(
                     "data dependency: score at "
                     + ", ".join(f"{100 * share:g} %" for share in shares),
-                    lambda m: ", ".join(shares[share].get(m, "-") for share in shares) or "-",
+                    lambda m: ", ".join(s[m] for s in shares.values() if m in s) or "-",
                 ),
             ],
         )
@@ -269,12 +269,13 @@ class _Report:
         places = [place for place in self.places(grid) if place.seed == 0]
         pictures = []
         for (data, backbone), of_key in _grouped(places, lambda p: (p.data, p.backbone)):
-            dataset = self.dataset(grid, str(data))
+            dataset = self.dataset(str(data))
             bundles = {place.method: self.folder.bundle(place.cell) for place in of_key}
             shown = _sequence_shown(of_key[0], dataset)
             drawn = {m: track(bundle, dataset, sequence=shown) for m, bundle in bundles.items()}
             pictures.append(
                 self.picture(
+                    f"sets-{grid.name}-{data}-{backbone}",
                     comparison(drawn),
                     f"{data}, {backbone}: sets of x over test frames, and of x and y, 0.9 marginal",
                 )
@@ -285,8 +286,14 @@ class _Report:
             for noise in map(parse_noise, grid.noises):
                 worse = noisy(dataset, noise, of_key[0].seed)
                 tracks[noise.name] = track(bundles[_TUBE_METHOD], worse, sequence=shown)
-            caption = f"{data}, {backbone}, {_TUBE_METHOD}: boxes of x, y and z under noise"
-            pictures.append(self.picture(tube(tracks), caption + ", thresholds of clean frames"))
+            pictures.append(
+                self.picture(
+                    f"tube-{grid.name}-{data}-{backbone}",
+                    tube(tracks),
+                    f"{data}, {backbone}, {_TUBE_METHOD}: boxes of x, y, z under noise, "
+                    "thresholds of clean frames",
+                )
+            )
         return pictures
 
     def curves(self, grid: Grid, title: str, places: Sequence[Place]) -> list[Picture]:
@@ -320,24 +327,23 @@ class _Report:
         drawn = {
             name: lines for name, lines in panels.items() if np.isfinite([*lines.values()]).any()
         }
-        return [self.picture(curves(option, values, drawn), f"{title}: {option}")]
+        name = f"curves-{grid.name}-{places[0].data}"
+        return [self.picture(name, curves(option, values, drawn), f"{title}: {option}")]
 
-    def picture(self, figure: Figure, caption: str) -> Picture:
+    def picture(self, name: str, figure: Figure, caption: str) -> Picture:
         """Write a picture as a file, and return it for the page."""
         stream = BytesIO()
         figure.savefig(stream, format="png", dpi=_DPI)
         content = stream.getvalue()
-        name = re.sub(r"[^\w.]+", "-", caption.split(": sets")[0].split(": boxes")[0]).lower()
-        kind = "sets" if ": sets" in caption else "tube" if ": boxes" in caption else "curve"
-        write_whole(self.folder.out / PICTURES_FOLDER / f"{kind}-{name}.png", content)
+        file = re.sub(r"[^\w.]+", "-", name).lower() + ".png"
+        write_whole(self.folder.out / PICTURES_FOLDER / file, content)
         return Picture(caption, "data:image/png;base64," + base64.b64encode(content).decode())
 
-    def dataset(self, grid: Grid, name: str) -> PoseDataset:
-        """Return the data set of this name, opened once."""
-        for text in grid.data:
-            if text not in self._opened:
-                self._opened[text] = open_dataset(expanded(text))
-        return next(self._opened[text] for text in grid.data if self._opened[text].name == name)
+    def dataset(self, label: str) -> PoseDataset:
+        """Return the data set of this label, opened once."""
+        if label not in self._opened:
+            self._opened[label] = open_dataset(expanded(self.results.data[label]))
+        return self._opened[label]
 
 
 def _grouped(

@@ -131,7 +131,7 @@ def test_results_hold_no_path_and_a_page_needs_no_other_file(studied):
     assert sources
     assert all(source.startswith("data:image/png;base64,") for source in sources)
     pictures = sorted(path.name.split("-")[0] for path in (folder.out / "pictures").iterdir())
-    assert pictures == ["curve", "sets", "tube"]
+    assert pictures == ["curves", "sets", "tube"]
     assert len(sources) == len(pictures)
     score = results.cells[results.places[0].cell].marginal.normalised_interval_score
     assert f"{score:.3f}" in html
@@ -176,6 +176,25 @@ def test_a_study_that_cannot_be_is_refused_before_anything(text, message, tmp_pa
 def test_a_missing_configuration_is_said(tmp_path):
     with pytest.raises(UsageError, match="cannot be read: No such file"):
         read_study(tmp_path / "none.toml")
+
+
+def test_two_data_sets_of_one_name_are_told_apart(monkeypatch, tmp_path):
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET)
+    other = f"{DATASET},seed=1"
+    text = CONFIG.replace('data = ["$CVO_TEST_DATA"]', f'data = ["$CVO_TEST_DATA", "{other}"]')
+    (tmp_path / "study.toml").write_text(text)
+    names = []
+
+    def only_named(tasks, ended):
+        names.extend(tasks)
+        raise InterruptedError
+
+    folder = CellFolder(tmp_path / "out", tmp_path / "out")
+    with pytest.raises(InterruptedError):
+        run_study(
+            read_study(tmp_path / "study.toml"), folder, only_named, ignore_progress, [].append
+        )
+    assert len(names) == 6
 
 
 def test_variables_are_replaced(monkeypatch):
