@@ -176,8 +176,14 @@ class CellFolder:
             for name, config in configs.items()
             if not self._complete(name, noises.get(name, ()))
         }
-        for config in {_features_of(config): config for config in missing.values()}.values():
-            prepare_features(config, self.features, progress)
+        sets = {_features_of(config): config for config in missing.values()}
+        for number, config in enumerate(sets.values(), 1):
+            where = f", set {number} of {len(sets)}"
+
+            def told(what: str, done: int, total: int, where: str = where) -> None:
+                progress(what + where, done, total)
+
+            prepare_features(config, self.features, told)
         failures: dict[str, CvoError] = {}
         count = 0
 

@@ -62,7 +62,7 @@ def curves(
     x_label: str, x: Sequence[object], panels: Mapping[str, Mapping[str, Sequence[float]]]
 ) -> Figure:
     """Draw panels of lines: panel -> line -> a value for each x; values of x evenly spaced."""
-    figure = _figure(4.2 * len(panels), 3.6)
+    figure = _figure(3.6 * len(panels), 3.6)
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for panel, (name, lines) in zip(axes, panels.items(), strict=True):
         for number, (label, values) in enumerate(lines.items()):

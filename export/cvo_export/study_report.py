@@ -123,8 +123,9 @@ class _Report:
         """Return a line for each backbone, method and value of the options that vary."""
         head = [
             *("backbone", "method", *varied),
-            *("coverage", "all six", "joint scope", "width", "score", "own coverage", "own score"),
-            *("point error", "width hard/easy", "rank corr.", "train s", "M param.", "ms"),
+            *("coverage", "all six", "joint scope", "width", "score"),
+            *("own coverage", "own width", "own score", "point error"),
+            *("width hard/easy", "rank corr.", "train s", "M param.", "ms"),
         ]
         rows = []
         for key, of_key in _grouped(places, lambda p: (p.backbone, p.method, *p.varied.values())):
@@ -136,10 +137,7 @@ class _Report:
                     *_shown([cell.marginal for cell in cells])[:2],
                     f"{_median(cell.joint.joint_coverage for cell in cells):.3f}",
                     *_shown([cell.marginal for cell in cells])[2:],
-                    f"{_median(figures.mean_coverage for figures in own):.3f}" if own else "-",
-                    f"{_median(figures.normalised_interval_score for figures in own):.3f}"
-                    if own
-                    else "-",
+                    *_own(own),
                     _error([cell.point_error for cell in cells]),
                     _adaptiveness(cells, "width_ratio"),
                     _adaptiveness(cells, "rank_correlation"),
@@ -305,8 +303,9 @@ class _Report:
         panels: dict[str, dict[str, list[float]]] = {
             "coverage, own bounds": {},
             "coverage, calibrated": {},
-            "score": {},
-            "mean width (cm)": {},
+            "mean width, own bounds (cm)": {},
+            "mean width, calibrated (cm)": {},
+            "score, calibrated": {},
         }
         for key, of_key in _grouped(
             places,
@@ -315,12 +314,13 @@ class _Report:
             label = " ".join(map(str, key))
             for value in values:
                 cells = [self.cell(p) for p in of_key if p.varied[option] == value]
-                own = [cell.own.mean_coverage for cell in cells if cell.own is not None]
+                own = [cell.own for cell in cells if cell.own is not None]
                 found = (
-                    _median(own) if own else float("nan"),
+                    _median(figures.mean_coverage for figures in own),
                     _median(cell.marginal.mean_coverage for cell in cells),
-                    _median(cell.marginal.normalised_interval_score for cell in cells),
+                    100 * _median(figures.mean_width.m for figures in own),
                     100 * _median(cell.marginal.mean_width.m for cell in cells),
+                    _median(cell.marginal.normalised_interval_score for cell in cells),
                 )
                 for panel, figure in zip(panels.values(), found, strict=True):
                     panel.setdefault(label, []).append(figure)
@@ -375,6 +375,14 @@ def _shown(figures: Sequence[Figures]) -> tuple[str, str, str, str]:
     )
 
 
+def _own(figures: Sequence[Figures]) -> tuple[str, str, str]:
+    """Coverage, mean width and score of the networks' own bounds, where they have some."""
+    if not figures:
+        return "-", "-", "-"
+    coverage, _, width, _ = _shown(figures)
+    return coverage, width, f"{_median(f.normalised_interval_score for f in figures):.3f}"
+
+
 def _error(errors: Sequence[Mapping[str, float]]) -> str:
     return (
         f"{100 * _median(error['median_m'] for error in errors):.2f} cm "
@@ -398,7 +406,9 @@ def _seconds(cells: Sequence[Cell]) -> str:
 
 
 def _median(values: Iterable[float]) -> float:
-    return float(np.median(list(values)))
+    """Median, NaN of nothing."""
+    found = list(values)
+    return float(np.median(found)) if found else float("nan")
 
 
 def _source(weights: str) -> str:
