@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import Struct
 from torch import nn
 
-from cvo_edge.errors import CvoError, SinkError, UsageError
+from cvo_edge.errors import CvoError, SinkError, SourceError, UsageError
 from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.files import read_json, write_json
@@ -43,7 +43,11 @@ class Width(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Figures(Struct, frozen=True, forbid_unknown_fields=True):
-    """Sets of 90 % on the test frames; coverage per DoF, their mean, and of all six at once."""
+    """Sets of 90 % on the test frames; coverage per DoF, their mean, and of all six at once.
+
+    Widths and score take an unbounded side to end where the workspace does; ``unbounded`` is the
+    share of frames that have one, None for bounds that always are finite.
+    """
 
     coverage: list[float]
     mean_coverage: float
@@ -51,18 +55,23 @@ class Figures(Struct, frozen=True, forbid_unknown_fields=True):
     mean_width: Width
     median_width: Width
     normalised_interval_score: float
+    unbounded: float | None
 
 
 class NoiseFigures(Struct, frozen=True, forbid_unknown_fields=True):
-    """Marginal sets on test frames with noise: by thresholds of clean frames, and of noisy ones."""
+    """Marginal sets on test frames with noise: by thresholds of clean frames, and of noisy ones.
 
+    Of the frames that passed the checks; ``invalid`` did not.
+    """
+
+    invalid: int
     point_error: dict[str, float]
     clean: Figures
     recalibrated: Figures
 
 
 class Seconds(Struct, frozen=True, forbid_unknown_fields=True):
-    """What training took, without the features."""
+    """What training took, without features of the network as it was in the beginning."""
 
     processor: float
     wall: float
@@ -84,13 +93,16 @@ class Cell(Struct, frozen=True, forbid_unknown_fields=True):
     training
         None for a run that was interrupted: then nobody has measured it.
     head_parameters, graph_parameters
-        What is trained behind the features, and all of the network.
+        Trained behind the features, and in all; what a forest holds is no parameter.
+    model_bytes
+        Of the ONNX file, with everything.
     adaptiveness
         How far widths follow errors, of the marginal sets; see ``cvo_export.evaluate``.
     pieces
         Share of the marginal sets that are in pieces; None where a method has none.
     noise
-        Figures on test frames with noise, by its name and strength.
+        Figures on test frames with noise, by its name and strength; None where no frame passed the
+        checks.
     """
 
     method: str
@@ -110,7 +122,7 @@ class Cell(Struct, frozen=True, forbid_unknown_fields=True):
     model_bytes: int
     adaptiveness: dict[str, float | None]
     pieces: float | None
-    noise: dict[str, NoiseFigures] = {}
+    noise: dict[str, NoiseFigures | None] = {}
 
 
 @dataclass(frozen=True)
@@ -229,24 +241,28 @@ def run_cell(
         write_json(folder.cell(name), _finished(folder, name, config))
     for text in noises:
         cell = folder.read(name)
-        if text in cell.noise:
-            continue
-        report = evaluate(
-            folder.bundle(name),
-            open_dataset(config.dataset),
-            "test",
-            threads=1,
-            noise=parse_noise(text),
-        )
-        figures = NoiseFigures(
-            point_error=report["point_error"],
-            clean=_figures(find_level(report["levels"], CONFIDENCE, "marginal")),
-            recalibrated=_figures(
-                find_level(report["recalibrated"]["levels"], CONFIDENCE, "marginal")
-            ),
-        )
-        noise = {**cell.noise, text: figures}
-        write_json(folder.cell(name), msgspec.structs.replace(cell, noise=noise))
+        if text not in cell.noise:
+            found = _with_noise(folder.bundle(name), config, text)
+            write_json(
+                folder.cell(name),
+                msgspec.structs.replace(cell, noise={**cell.noise, text: found}),
+            )
+
+
+def _with_noise(bundle: Path, config: TrainConfig, text: str) -> NoiseFigures | None:
+    dataset = open_dataset(config.dataset)
+    try:
+        report = evaluate(bundle, dataset, "test", threads=1, noise=parse_noise(text))
+    except SourceError:
+        # The same frames without noise have been read: these did not pass the checks, not one.
+        return None
+    again = report["recalibrated"]["levels"]
+    return NoiseFigures(
+        invalid=report["frames"]["invalid"],
+        point_error=report["point_error"],
+        clean=_figures(find_level(report["levels"], CONFIDENCE, "marginal")),
+        recalibrated=_figures(find_level(again, CONFIDENCE, "marginal")),
+    )
 
 
 def _finished(folder: CellFolder, name: str, config: TrainConfig) -> Cell:
@@ -292,15 +308,20 @@ def _features_of(config: TrainConfig) -> bytes:
 
 
 class _Clock:
-    """Seconds since the features were there, as training reports them."""
+    """Seconds since the first features were there, as training reports them.
+
+    Those of a backbone that has learnt, of fine-tuning, are made within training and counted.
+    """
 
     def __init__(self) -> None:
         self._begin = (process_time(), perf_counter())
+        self._begun = False
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """As ``Progress``."""
-        if what == "features" and done == total:
+        if not self._begun and what == "features" and done == total:
             self._begin = (process_time(), perf_counter())
+            self._begun = True
 
     def seconds(self) -> Seconds:
         processor, wall = self._begin
@@ -319,6 +340,7 @@ def _figures(level: Mapping[str, Any]) -> Figures:
         mean_width=width("mean_width"),
         median_width=width("median_width"),
         normalised_interval_score=level["normalised_interval_score"],
+        unbounded=level.get("unbounded_share"),
     )
 
 

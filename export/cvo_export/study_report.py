@@ -103,7 +103,8 @@ class _Report:
                 pictures += self.curves(grid, title, places)
             else:
                 tables.append(self.figures_table(title, places, ()))
-                tables += [self.noise_table(title, places)] if grid.noises else []
+            if grid.noises:
+                tables.append(self.noise_table(title, places, grid))
         if not grid.vary:
             pictures += self.sets(grid)
         seeds = "one seed" if grid.seeds == 1 else f"{grid.seeds} seeds: medians, each in brackets"
@@ -148,26 +149,32 @@ class _Report:
             )
         return Table(title, head, rows)
 
-    def noise_table(self, title: str, places: Sequence[Place]) -> Table:
-        """Return a line for each backbone, method and noise: both policies beside clean frames."""
+    def noise_table(self, title: str, places: Sequence[Place], grid: Grid) -> Table:
+        """Return a line for each backbone, method, value that varies and noise: both policies."""
         head = [
-            *("backbone", "method", "noise", "point error"),
-            *("thresholds of clean frames: coverage", "all six", "width", "score"),
-            *("recalibrated: coverage", "all six", "width", "score"),
+            *("backbone", "method", *grid.vary, "noise", "invalid", "point error"),
+            *("thresholds of clean frames: coverage", "all six", "mean width", "score"),
+            *("recalibrated: coverage", "all six", "mean width", "score"),
         ]
         rows = []
-        for (backbone, method), of_key in _grouped(places, lambda p: (p.backbone, p.method)):
-            cells = [self.cell(place) for place in of_key]
+        for key, of_key in _grouped(places, lambda p: (p.backbone, p.method, *p.varied.values())):
+            cells, named = [self.cell(place) for place in of_key], [str(value) for value in key]
             clean = _shown([cell.marginal for cell in cells])
             error = _error([cell.point_error for cell in cells])
-            rows.append([backbone, method, "none", error, *clean, *clean])
-            for name in cells[0].noise:
-                noise = [cell.noise[name] for cell in cells]
+            invalid = _share_invalid(cells, [cell.frames["invalid"] for cell in cells])
+            rows.append([*named, "none", invalid, error, *clean, *clean])
+            for name in _noises(grid):
+                found = [cell.noise[name] for cell in cells]
+                noise = [figures for figures in found if figures is not None]
+                if len(noise) < len(found):
+                    rows.append([*named, name, "all of a seed's frames", *(["-"] * 9)])
+                    continue
                 rows.append(
                     [
-                        *(backbone, method, name, _error([found.point_error for found in noise])),
-                        *_shown([found.clean for found in noise]),
-                        *_shown([found.recalibrated for found in noise]),
+                        *(*named, name, _share_invalid(cells, [n.invalid for n in noise])),
+                        _error([figures.point_error for figures in noise]),
+                        *_shown([figures.clean for figures in noise]),
+                        *_shown([figures.recalibrated for figures in noise]),
                     ]
                 )
         return Table(f"{title}, with noise", head, rows)
@@ -281,9 +288,9 @@ class _Report:
             if _TUBE_METHOD not in bundles or not grid.noises:
                 continue
             tracks = {"none": drawn[_TUBE_METHOD]}
-            for noise in map(parse_noise, grid.noises):
-                worse = noisy(dataset, noise, of_key[0].seed)
-                tracks[noise.name] = track(bundles[_TUBE_METHOD], worse, sequence=shown)
+            for name in _noises(grid):
+                worse = noisy(dataset, parse_noise(name), of_key[0].seed)
+                tracks[name] = track(bundles[_TUBE_METHOD], worse, sequence=shown)
             pictures.append(
                 self.picture(
                     f"tube-{grid.name}-{data}-{backbone}",
@@ -344,6 +351,17 @@ class _Report:
         if label not in self._opened:
             self._opened[label] = open_dataset(expanded(self.results.data[label]))
         return self._opened[label]
+
+
+def _noises(grid: Grid) -> list[str]:
+    """Noises of a grid by the names that cells have them under."""
+    return list(dict.fromkeys(str(parse_noise(text)) for text in grid.noises))
+
+
+def _share_invalid(cells: Sequence[Cell], invalid: Sequence[int]) -> str:
+    """Median share of the test frames that did not pass the checks."""
+    totals = [cell.frames["total"] for cell in cells]
+    return f"{100 * _median(np.divide(invalid, totals).tolist()):.1f} %"
 
 
 def _grouped(
