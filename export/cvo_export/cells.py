@@ -6,8 +6,10 @@ Cells run beside each other, torch with one thread in each.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,14 +21,16 @@ import numpy as np
 from msgspec import Struct
 from torch import nn
 
+from cvo_edge.artifact import read_calibration
 from cvo_edge.errors import CvoError, SinkError, SourceError, UsageError
-from cvo_export.datasets import open_dataset
+from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.files import read_json, write_json
 from cvo_export.noise import parse_noise
 from cvo_export.progress import Progress
 from cvo_export.publish import publish
 from cvo_export.run import TrainConfig
+from cvo_export.splits import same_split
 from cvo_export.train import prepare_features, train
 from cvo_export.workers import Engine
 
@@ -164,6 +168,36 @@ class CellFolder:
                 f"{self.out}: expected cells of the same options, found others: {', '.join(others)}"
             )
 
+    def check_data(self, configs: Mapping[str, TrainConfig]) -> None:
+        """Raise UsageError where a finished cell is of another data set or other weights.
+
+        Names of cells depend on no place: what is found there now may be something else.
+        """
+        opened: dict[str, PoseDataset] = {}
+        digests: dict[str, str] = {}
+        for name, config in configs.items():
+            if not self.cell(name).is_file():
+                continue
+            made = read_calibration(self.bundle(name))
+            if config.dataset not in opened:
+                opened[config.dataset] = open_dataset(config.dataset)
+            try:
+                same_split(opened[config.dataset], made.calibration.split)
+            except (SourceError, UsageError) as error:
+                raise UsageError(
+                    f"{self.cell(name)}: expected a cell of {config.dataset}: {error}"
+                ) from None
+            given = Path(config.weights)
+            if made.provenance.weights_sha256 is not None and given.is_file():
+                if config.weights not in digests:
+                    digests[config.weights] = _file_sha256(given)
+                found = digests[config.weights]
+                if found != made.provenance.weights_sha256:
+                    raise UsageError(
+                        f"{self.cell(name)}: expected a cell of weights {found[:16]}..., found one "
+                        f"of {made.provenance.weights_sha256[:16]}..."
+                    )
+
     def fill(
         self,
         configs: Mapping[str, TrainConfig],
@@ -179,16 +213,41 @@ class CellFolder:
         Raises the first failure's kind after all have been tried, SinkError where the folder cannot
         be written.
         """
+        with self._locked():
+            return self._fill(configs, noises, engine, progress, say)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Keep a second program out: both would write the same runs."""
         try:
             self.out.mkdir(parents=True, exist_ok=True)
+            lock = (self.out / ".lock").open("w")
         except OSError as error:
             raise SinkError(f"{self.out}: cannot be written: {error.strerror}") from None
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UsageError(
+                    f"{self.out}: expected a folder that nobody is filling, found one in use"
+                ) from None
+            yield
+
+    def _fill(
+        self,
+        configs: Mapping[str, TrainConfig],
+        noises: Mapping[str, Sequence[str]],
+        engine: Engine,
+        progress: Progress,
+        say: Say,
+    ) -> dict[str, Cell]:
         missing = {
             name: config
             for name, config in configs.items()
             if not self._complete(name, noises.get(name, ()))
         }
-        sets = {_features_of(config): config for config in missing.values()}
+        untrained = [c for name, c in missing.items() if not self.cell(name).is_file()]
+        sets = {_features_of(config): config for config in untrained}
         for number, config in enumerate(sets.values(), 1):
             where = f", set {number} of {len(sets)}"
 
@@ -295,6 +354,11 @@ def _finished(folder: CellFolder, name: str, config: TrainConfig) -> Cell:
         adaptiveness=marginal["adaptiveness"],
         pieces=None if pieces is None else float(np.mean(pieces)),
     )
+
+
+def _file_sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def digest(config: TrainConfig) -> str:
