@@ -346,7 +346,8 @@ class _Report:
                 self.picture(
                     f"sets-{grid.name}-{data}-{backbone}",
                     comparison(drawn),
-                    f"{data}, {backbone}: sets of x over test frames, and of x and y, 0.9 marginal",
+                    f"{data}, {backbone}: sets of 0.9, of x over the test frames and of x and y, "
+                    "as they are and about the truth; crosses are frames that a set missed",
                 )
             )
             if _TUBE_METHOD not in bundles or not grid.noises:
