@@ -35,6 +35,7 @@ def ray_engine() -> Iterator[Engine]:
 
     Raises UsageError where ray is not installed or there is no cluster.
     """
+    _take_the_heads_side()
     try:
         import ray
     except ImportError:
@@ -59,6 +60,17 @@ def ray_engine() -> Iterator[Engine]:
         yield partial(_run, ray)
     finally:
         ray.shutdown()
+
+
+def _take_the_heads_side() -> None:
+    """Use a token where ``ray start`` does: where its user has one, unless told otherwise.
+
+    Ray reads the variable when it is imported.
+    """
+    kept = Path("~/.ray/auth_token").expanduser()
+    named = "RAY_AUTH_TOKEN" in os.environ or "RAY_AUTH_TOKEN_PATH" in os.environ
+    if "RAY_AUTH_MODE" not in os.environ and (named or kept.exists()):
+        os.environ["RAY_AUTH_MODE"] = "token"
 
 
 def _address() -> str | None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from time import monotonic
 
 import pytest
 
@@ -26,14 +27,18 @@ def cluster(monkeypatch):
         found.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{found.getsockname()[1]}"
     monkeypatch.setenv("RAY_ADDRESS", address)
+    # Whatever tokens this machine's user has.
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     options = [f"--port={address.split(':')[1]}", "--node-ip-address=127.0.0.1", "--num-cpus=2"]
     quiet = ["--include-dashboard=false", "--disable-usage-stats"]
     command = [RAY, "start", "--head", "--block", *options, *quiet]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as head:
         try:
             health = [RAY, "health-check", "--address", address]
+            deadline = monotonic() + 60.0
             while subprocess.run(health, check=False, capture_output=True).returncode != 0:
                 assert head.poll() is None
+                assert monotonic() < deadline
             yield
         finally:
             head.terminate()
@@ -64,12 +69,13 @@ def test_outcomes_are_those_of_the_tasks_and_a_killed_worker_is_run_again(
         "die": partial(die_once, tmp_path / "died"),
         "where": partial(write, Path("relative"), "to the folder of the study"),
     }
-    monkeypatch.chdir(tmp_path)
     found = {}
     before = signal.getsignal(signal.SIGTERM)
     with ray_engine() as run:
         # Our programs leave with their own exit codes.
         assert signal.getsignal(signal.SIGTERM) == before
+        # Workers were started with this folder's modules, and find them.
+        monkeypatch.chdir(tmp_path)
         run(tasks, found.__setitem__)
     assert set(found) == set(tasks)
     assert found["write"] is None
@@ -100,3 +106,31 @@ def test_no_address_at_all_is_refused(monkeypatch, tmp_path):
     (tmp_path / "ray" / "ray_current_cluster").write_text("127.0.0.1:9")
     with pytest.raises(UsageError, match=r"at 127.0.0.1:9, found none"), ray_engine():
         raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("environment", "has_token", "expected"),
+    [
+        ({}, False, None),
+        ({}, True, "token"),
+        ({"RAY_AUTH_TOKEN": "secret"}, False, "token"),
+        ({"RAY_AUTH_MODE": "disabled"}, True, "disabled"),
+    ],
+)
+def test_a_token_is_used_where_ray_start_uses_it(
+    environment, has_token, expected, monkeypatch, tmp_path
+):
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    if has_token:
+        (tmp_path / ".ray").mkdir()
+        (tmp_path / ".ray" / "auth_token").write_text("secret")
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
+    with pytest.raises(UsageError, match="none"), ray_engine():
+        raise AssertionError
+    assert os.environ.get("RAY_AUTH_MODE") == expected
+    # Set by us: not undone by the patch where it was not there before.
+    os.environ.pop("RAY_AUTH_MODE", None)
