@@ -214,7 +214,49 @@ class CellFolder:
         be written.
         """
         with self._locked():
-            return self._fill(configs, noises, engine, progress, say)
+            missing = {
+                name: config
+                for name, config in configs.items()
+                if not self._complete(name, noises.get(name, ()))
+            }
+            untrained = [c for name, c in missing.items() if not self.cell(name).is_file()]
+            sets = {_features_of(config): config for config in untrained}
+            for number, config in enumerate(sets.values(), 1):
+                where = f", set {number} of {len(sets)}"
+
+                def told(what: str, done: int, total: int, where: str = where) -> None:
+                    progress(what + where, done, total)
+
+                prepare_features(config, self.features, told)
+            failures: dict[str, CvoError] = {}
+            count = 0
+
+            def ended(name: str, failure: CvoError | None) -> None:
+                nonlocal count
+                count += 1
+                if failure is None:
+                    marginal = self.read(name).marginal
+                    result = (
+                        f"score {marginal.normalised_interval_score:.3f}, "
+                        f"coverage {marginal.mean_coverage:.3f}"
+                    )
+                else:
+                    failures[name] = failure
+                    result = f"failed: {failure}"
+                say(f"{name}: {result} ({count} of {len(missing)})")
+
+            tasks = {
+                name: partial(run_cell, self, name, config, tuple(noises.get(name, ())))
+                for name, config in missing.items()
+            }
+            engine(tasks, ended)
+            if failures:
+                first = next(iter(failures.values()))
+                raise type(first)(
+                    f"{self.out}: expected {len(missing)} more cells, found "
+                    f"{len(missing) - len(failures)}; failed: {', '.join(failures)}"
+                )
+            return {name: self.read(name) for name in configs}
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
@@ -232,58 +274,6 @@ class CellFolder:
                     f"{self.out}: expected a folder that nobody is filling, found one in use"
                 ) from None
             yield
-
-    def _fill(
-        self,
-        configs: Mapping[str, TrainConfig],
-        noises: Mapping[str, Sequence[str]],
-        engine: Engine,
-        progress: Progress,
-        say: Say,
-    ) -> dict[str, Cell]:
-        missing = {
-            name: config
-            for name, config in configs.items()
-            if not self._complete(name, noises.get(name, ()))
-        }
-        untrained = [c for name, c in missing.items() if not self.cell(name).is_file()]
-        sets = {_features_of(config): config for config in untrained}
-        for number, config in enumerate(sets.values(), 1):
-            where = f", set {number} of {len(sets)}"
-
-            def told(what: str, done: int, total: int, where: str = where) -> None:
-                progress(what + where, done, total)
-
-            prepare_features(config, self.features, told)
-        failures: dict[str, CvoError] = {}
-        count = 0
-
-        def ended(name: str, failure: CvoError | None) -> None:
-            nonlocal count
-            count += 1
-            if failure is None:
-                marginal = self.read(name).marginal
-                result = (
-                    f"score {marginal.normalised_interval_score:.3f}, "
-                    f"coverage {marginal.mean_coverage:.3f}"
-                )
-            else:
-                failures[name] = failure
-                result = f"failed: {failure}"
-            say(f"{name}: {result} ({count} of {len(missing)})")
-
-        tasks = {
-            name: partial(run_cell, self, name, config, tuple(noises.get(name, ())))
-            for name, config in missing.items()
-        }
-        engine(tasks, ended)
-        if failures:
-            first = next(iter(failures.values()))
-            raise type(first)(
-                f"{self.out}: expected {len(missing)} more cells, found "
-                f"{len(missing) - len(failures)}; failed: {', '.join(failures)}"
-            )
-        return {name: self.read(name) for name in configs}
 
     def _complete(self, name: str, noises: Sequence[str]) -> bool:
         return self.cell(name).is_file() and set(noises) <= set(self.read(name).noise)
