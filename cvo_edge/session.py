@@ -1,9 +1,10 @@
-"""The only file that knows onnxruntime: model bytes -> a session that checks what it is."""
+"""The only file that knows onnxruntime: a model -> a session that checks what it is."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import onnxruntime
@@ -11,8 +12,11 @@ from numpy.typing import NDArray
 
 from cvo_edge.artifact import Dtype, ModelSpec, TensorSpec
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
+from cvo_edge.prepared import GRAPH_FILE, WEIGHTS_FILE, Prepared
 
 MAX_THREADS = 64
+# Smaller ones stay in the graph: shapes and scales, of no size.
+_SMALL_TENSOR = 1024
 
 _DTYPES: dict[str, Dtype] = {"tensor(uint8)": "uint8", "tensor(float)": "float32"}
 
@@ -29,13 +33,15 @@ class Session:
 
     Parameters
     ----------
-    model_bytes
+    model
         The model itself, never a path: what was digest-checked is what runs, and a model cannot
-        reach for other files.
+        reach for other files. Or what a cache has of it.
     threads
         Threads of one inference; all allowed cores by default.
     expected
         What the calibration says of inputs and outputs; None to take the model as it is.
+    keep_in
+        Folder to which the prepared model is written, for a cache.
 
     Attributes
     ----------
@@ -53,7 +59,12 @@ class Session:
     """
 
     def __init__(
-        self, model_bytes: bytes, threads: int | None = None, expected: ModelSpec | None = None
+        self,
+        model: bytes | Prepared,
+        threads: int | None = None,
+        expected: ModelSpec | None = None,
+        *,
+        keep_in: Path | None = None,
     ) -> None:
         # The engine would take a thousand, and minutes for a frame.
         if threads is not None and not 1 <= threads <= MAX_THREADS:
@@ -67,9 +78,20 @@ class Session:
         # keeps the speed inside one call and gives the cores back after it.
         options.add_session_config_entry("session.force_spinning_stop", "1")
         options.log_severity_level = 4
+        if keep_in is not None:
+            options.optimized_model_filepath = str(keep_in / GRAPH_FILE)
+            prefix = "session.optimized_model_external_initializers_"
+            options.add_session_config_entry(prefix + "file_name", WEIGHTS_FILE)
+            options.add_session_config_entry(prefix + "min_size_in_bytes", str(_SMALL_TENSOR))
+        content = model
+        if isinstance(model, Prepared):
+            content = model.graph
+            options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+            key = "session.model_external_initializers_file_folder_path"
+            options.add_session_config_entry(key, str(model.folder))
         try:
             self.engine = onnxruntime.InferenceSession(
-                model_bytes, options, providers=["CPUExecutionProvider"]
+                content, options, providers=["CPUExecutionProvider"]
             )
         # onnxruntime raises a dozen unrelated types here, UnicodeDecodeError among them.
         except Exception as error:
