@@ -46,6 +46,7 @@ SixOrUnbounded = tuple[
     float | None, float | None, float | None, float | None, float | None, float | None
 ]
 Dtype = Literal["uint8", "float32"]
+Precision = Literal["fp32", "int8"]
 MethodName = Literal["cqr", "csp", "mcqr", "cjp"]
 Quaternion = tuple[float, float, float, float]
 Parameters = TypeVar("Parameters", bound=Struct)
@@ -69,7 +70,7 @@ class ModelSpec(_Strict, frozen=True):
     file: Literal["model.onnx"]
     sha256: Sha256
     opset: Annotated[int, Meta(ge=1)]
-    precision: Literal["fp32", "int8"]
+    precision: Precision
     inputs: tuple[TensorSpec, ...]
     outputs: tuple[TensorSpec, ...]
 
