@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 MATRIX_SUFFIX = ".pose.txt"
 
-# Frames are matched to the nearest ground-truth stamp within this bound, as the TUM tools do.
+# Frames are matched to the nearest ground-truth stamp within this bound, that of the TUM tools.
 MAX_STAMP_DIFFERENCE_NS = 20_000_000
 
 _MAX_BYTES = 256 << 20

@@ -65,8 +65,12 @@ class Backbone(nn.Module):
         try:
             # timm's models share methods that nn.Module does not declare.
             self.body: Any = timm.create_model(config.name, pretrained=False, num_classes=0)
-        except RuntimeError as error:
-            raise UsageError(f"backbone: {error}") from None
+        # Names may lead to folders and servers, which fail in their own ways.
+        except (RuntimeError, ValueError, OSError) as error:
+            line = next(iter(str(error).splitlines()), type(error).__name__)
+            raise UsageError(
+                f"backbone: expected a model of timm, found {config.name}: {line}"
+            ) from None
         if not hasattr(self.body, "prune_intermediate_layers"):
             raise UsageError(f"backbone: expected a network with stages, found {config.name}")
         mean, std = _mean_std(self.body, config.normalisation)

@@ -6,8 +6,10 @@ Cells run beside each other, torch with one thread in each.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,14 +21,16 @@ import numpy as np
 from msgspec import Struct
 from torch import nn
 
-from cvo_edge.errors import CvoError, SinkError, UsageError
-from cvo_export.datasets import open_dataset
+from cvo_edge.artifact import read_calibration
+from cvo_edge.errors import CvoError, SinkError, SourceError, UsageError
+from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.files import read_json, write_json
 from cvo_export.noise import parse_noise
 from cvo_export.progress import Progress
 from cvo_export.publish import publish
 from cvo_export.run import TrainConfig
+from cvo_export.splits import same_split
 from cvo_export.train import prepare_features, train
 from cvo_export.workers import Engine
 
@@ -43,7 +47,11 @@ class Width(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Figures(Struct, frozen=True, forbid_unknown_fields=True):
-    """Sets of 90 % on the test frames; coverage per DoF, their mean, and of all six at once."""
+    """Sets of 90 % on the test frames; coverage per DoF, their mean, and of all six at once.
+
+    Widths and score take an unbounded side to end where the workspace does; ``unbounded`` is the
+    share of frames that have one, None for bounds that always are finite.
+    """
 
     coverage: list[float]
     mean_coverage: float
@@ -51,18 +59,23 @@ class Figures(Struct, frozen=True, forbid_unknown_fields=True):
     mean_width: Width
     median_width: Width
     normalised_interval_score: float
+    unbounded: float | None
 
 
 class NoiseFigures(Struct, frozen=True, forbid_unknown_fields=True):
-    """Marginal sets on test frames with noise: by thresholds of clean frames, and of noisy ones."""
+    """Marginal sets on test frames with noise: by thresholds of clean frames, and of noisy ones.
 
+    Of the frames that passed the checks; ``invalid`` did not.
+    """
+
+    invalid: int
     point_error: dict[str, float]
     clean: Figures
     recalibrated: Figures
 
 
 class Seconds(Struct, frozen=True, forbid_unknown_fields=True):
-    """What training took, without the features."""
+    """What training took, without features of the network as it was in the beginning."""
 
     processor: float
     wall: float
@@ -84,13 +97,16 @@ class Cell(Struct, frozen=True, forbid_unknown_fields=True):
     training
         None for a run that was interrupted: then nobody has measured it.
     head_parameters, graph_parameters
-        What is trained behind the features, and all of the network.
+        Trained behind the features, and in all; what a forest holds is no parameter.
+    model_bytes
+        Of the ONNX file, with everything.
     adaptiveness
         How far widths follow errors, of the marginal sets; see ``cvo_export.evaluate``.
     pieces
         Share of the marginal sets that are in pieces; None where a method has none.
     noise
-        Figures on test frames with noise, by its name and strength.
+        Figures on test frames with noise, by its name and strength; None where no frame passed the
+        checks.
     """
 
     method: str
@@ -110,7 +126,7 @@ class Cell(Struct, frozen=True, forbid_unknown_fields=True):
     model_bytes: int
     adaptiveness: dict[str, float | None]
     pieces: float | None
-    noise: dict[str, NoiseFigures] = {}
+    noise: dict[str, NoiseFigures | None] = {}
 
 
 @dataclass(frozen=True)
@@ -152,6 +168,36 @@ class CellFolder:
                 f"{self.out}: expected cells of the same options, found others: {', '.join(others)}"
             )
 
+    def check_data(self, configs: Mapping[str, TrainConfig]) -> None:
+        """Raise UsageError where a finished cell is of another data set or other weights.
+
+        Names of cells depend on no place: what is found there now may be something else.
+        """
+        opened: dict[str, PoseDataset] = {}
+        digests: dict[str, str] = {}
+        for name, config in configs.items():
+            if not self.cell(name).is_file():
+                continue
+            made = read_calibration(self.bundle(name))
+            if config.dataset not in opened:
+                opened[config.dataset] = open_dataset(config.dataset)
+            try:
+                same_split(opened[config.dataset], made.calibration.split)
+            except (SourceError, UsageError) as error:
+                raise UsageError(
+                    f"{self.cell(name)}: expected a cell of {config.dataset}: {error}"
+                ) from None
+            given = Path(config.weights)
+            if made.provenance.weights_sha256 is not None and given.is_file():
+                if config.weights not in digests:
+                    digests[config.weights] = _file_sha256(given)
+                found = digests[config.weights]
+                if found != made.provenance.weights_sha256:
+                    raise UsageError(
+                        f"{self.cell(name)}: expected a cell of weights {found[:16]}..., found one "
+                        f"of {made.provenance.weights_sha256[:16]}..."
+                    )
+
     def fill(
         self,
         configs: Mapping[str, TrainConfig],
@@ -167,16 +213,41 @@ class CellFolder:
         Raises the first failure's kind after all have been tried, SinkError where the folder cannot
         be written.
         """
+        with self._locked():
+            return self._fill(configs, noises, engine, progress, say)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Keep a second program out: both would write the same runs."""
         try:
             self.out.mkdir(parents=True, exist_ok=True)
+            lock = (self.out / ".lock").open("w")
         except OSError as error:
             raise SinkError(f"{self.out}: cannot be written: {error.strerror}") from None
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UsageError(
+                    f"{self.out}: expected a folder that nobody is filling, found one in use"
+                ) from None
+            yield
+
+    def _fill(
+        self,
+        configs: Mapping[str, TrainConfig],
+        noises: Mapping[str, Sequence[str]],
+        engine: Engine,
+        progress: Progress,
+        say: Say,
+    ) -> dict[str, Cell]:
         missing = {
             name: config
             for name, config in configs.items()
             if not self._complete(name, noises.get(name, ()))
         }
-        sets = {_features_of(config): config for config in missing.values()}
+        untrained = [c for name, c in missing.items() if not self.cell(name).is_file()]
+        sets = {_features_of(config): config for config in untrained}
         for number, config in enumerate(sets.values(), 1):
             where = f", set {number} of {len(sets)}"
 
@@ -229,24 +300,28 @@ def run_cell(
         write_json(folder.cell(name), _finished(folder, name, config))
     for text in noises:
         cell = folder.read(name)
-        if text in cell.noise:
-            continue
-        report = evaluate(
-            folder.bundle(name),
-            open_dataset(config.dataset),
-            "test",
-            threads=1,
-            noise=parse_noise(text),
-        )
-        figures = NoiseFigures(
-            point_error=report["point_error"],
-            clean=_figures(find_level(report["levels"], CONFIDENCE, "marginal")),
-            recalibrated=_figures(
-                find_level(report["recalibrated"]["levels"], CONFIDENCE, "marginal")
-            ),
-        )
-        noise = {**cell.noise, text: figures}
-        write_json(folder.cell(name), msgspec.structs.replace(cell, noise=noise))
+        if text not in cell.noise:
+            found = _with_noise(folder.bundle(name), config, text)
+            write_json(
+                folder.cell(name),
+                msgspec.structs.replace(cell, noise={**cell.noise, text: found}),
+            )
+
+
+def _with_noise(bundle: Path, config: TrainConfig, text: str) -> NoiseFigures | None:
+    dataset = open_dataset(config.dataset)
+    try:
+        report = evaluate(bundle, dataset, "test", threads=1, noise=parse_noise(text))
+    except SourceError:
+        # The same frames without noise have been read: these did not pass the checks, not one.
+        return None
+    again = report["recalibrated"]["levels"]
+    return NoiseFigures(
+        invalid=report["frames"]["invalid"],
+        point_error=report["point_error"],
+        clean=_figures(find_level(report["levels"], CONFIDENCE, "marginal")),
+        recalibrated=_figures(find_level(again, CONFIDENCE, "marginal")),
+    )
 
 
 def _finished(folder: CellFolder, name: str, config: TrainConfig) -> Cell:
@@ -281,6 +356,11 @@ def _finished(folder: CellFolder, name: str, config: TrainConfig) -> Cell:
     )
 
 
+def _file_sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def digest(config: TrainConfig) -> str:
     """sha256 of a run's configuration."""
     return hashlib.sha256(msgspec.json.encode(config)).hexdigest()
@@ -292,15 +372,20 @@ def _features_of(config: TrainConfig) -> bytes:
 
 
 class _Clock:
-    """Seconds since the features were there, as training reports them."""
+    """Seconds since the first features were there, as training reports them.
+
+    Those of a backbone that has learnt, of fine-tuning, are made within training and counted.
+    """
 
     def __init__(self) -> None:
         self._begin = (process_time(), perf_counter())
+        self._begun = False
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """As ``Progress``."""
-        if what == "features" and done == total:
+        if not self._begun and what == "features" and done == total:
             self._begin = (process_time(), perf_counter())
+            self._begun = True
 
     def seconds(self) -> Seconds:
         processor, wall = self._begin
@@ -319,6 +404,7 @@ def _figures(level: Mapping[str, Any]) -> Figures:
         mean_width=width("mean_width"),
         median_width=width("median_width"),
         normalised_interval_score=level["normalised_interval_score"],
+        unbounded=level.get("unbounded_share"),
     )
 
 

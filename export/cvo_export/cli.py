@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import nullcontext
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -641,24 +642,22 @@ def study(
     """
     from cvo_edge.session import allowed_cores
     from cvo_export.cells import CellFolder
-    from cvo_export.ray_engine import run_tasks_on_ray
+    from cvo_export.ray_engine import ray_engine
     from cvo_export.study import read_study, run_study
-    from cvo_export.study_report import write_report
+    from cvo_export.study_report import page_template, write_report
     from cvo_export.workers import run_tasks
 
     if engine is EngineName.RAY and jobs is not None:
         raise UsageError("jobs: expected with the engine local alone, found it with ray")
-    on_this_machine = partial(run_tasks, jobs or allowed_cores())
-    with show_progress() as progress:
+    # Hours later would be late to learn that a page cannot be written.
+    template = page_template()
+    grids = read_study(config)
+    local = nullcontext(partial(run_tasks, jobs or allowed_cores()))
+    with local if engine is EngineName.LOCAL else ray_engine() as run, show_progress() as progress:
         folder = CellFolder(out.resolve(), (cache or out / "features").resolve())
-        results = run_study(
-            read_study(config),
-            folder,
-            on_this_machine if engine is EngineName.LOCAL else run_tasks_on_ray,
-            progress,
-            partial(print, file=sys.stderr, flush=True),
-        )
-    print(write_report(results, folder))
+        say = partial(print, file=sys.stderr, flush=True)
+        results = run_study(grids, folder, run, progress, say)
+    print(write_report(results, folder, template))
 
 
 @app.command()

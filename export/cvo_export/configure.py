@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any, cast
 
@@ -68,12 +69,15 @@ def _head_config(method: str, options: dict[str, Any]) -> TrainableConfig:
         raise UsageError(f"method: expected one of {', '.join(TRAINABLE)}, found {method}")
     kind = TRAINABLE[method].config
     given = {name: value for name, value in options.items() if value is not None}
-    foreign = [name for name in given if name not in kind.__struct_fields__]
-    if foreign:
-        raise UsageError(
-            f"{foreign[0].replace('_', '-')}: expected an option of {method}, found one of another "
-            "method"
-        )
+    for name, value in given.items():
+        shown = name.replace("_", "-")
+        if name not in kind.__struct_fields__:
+            raise UsageError(
+                f"{shown}: expected an option of {method} "
+                f"({', '.join(kind.__struct_fields__).replace('_', '-')}), found none of it"
+            )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise UsageError(f"{shown}: expected a finite number, found {value}")
     try:
         return cast("TrainableConfig", msgspec.convert({"method": method, **given}, kind))
     except msgspec.ValidationError as error:

@@ -47,6 +47,7 @@ _INDICATIVE = "? indicative: frames of one recording are no independent draws"
 _NO_CLAIM = "- no band: thresholds of clean frames promise nothing of noisy ones"
 
 _LEAST_WIDTH = 1e-3
+_ROUNDING = 1e-9
 _LARGEST_LOG = 700.0
 
 
@@ -174,6 +175,25 @@ def region_log_volume(region: ConformalSet, deviation: Array, seed: int) -> floa
         return float(box)
     ellipsoids = ellipsoids_log_volume(region.ellipsoids, seed) - np.log(deviation).sum()
     return float(min(ellipsoids, box))
+
+
+def adaptiveness(width: Array, error: Array) -> dict[str, float | None]:
+    """Widths and absolute errors (n, 6) -> ``_Sets.adaptiveness``."""
+    third = len(error) // 3
+    # What differs by rounding alone is one width.
+    if third == 0 or not np.all(np.ptp(width, axis=0) > _ROUNDING * np.abs(width).max(axis=0)):
+        return {"width_ratio": None, "rank_correlation": None}
+    ratios, correlations = [], []
+    for dof in range(width.shape[1]):
+        ordered = width[np.argsort(error[:, dof]), dof]
+        if not ordered[:third].mean() > 0.0:
+            return {"width_ratio": None, "rank_correlation": None}
+        ratios.append(ordered[-third:].mean() / ordered[:third].mean())
+        correlations.append(spearmanr(width[:, dof], error[:, dof]).statistic)
+    return {
+        "width_ratio": float(np.mean(ratios)),
+        "rank_correlation": float(np.mean(correlations)),
+    }
 
 
 def coverage_band(n_calibration: int, n_test: int, confidence: float) -> list[float] | None:
@@ -415,22 +435,12 @@ class _Sets:
 
         ``width_ratio``: mean width on the third of the frames with the largest errors over that on
         the third with the least; ``rank_correlation``: Spearman's, of width and error. None where a
-        degree of freedom has one width for all frames, or too few frames.
+        degree of freedom has one width for all frames, or none at all, and with too few frames.
         """
-        width = np.array([region.width() for region in regions])
-        error = np.abs(self.seen.truth - self.seen.point)
-        third = len(error) // 3
-        if third == 0 or not np.all(np.ptp(width, axis=0) > 0.0):
-            return {"width_ratio": None, "rank_correlation": None}
-        ratios, correlations = [], []
-        for dof in range(width.shape[1]):
-            ordered = width[np.argsort(error[:, dof]), dof]
-            ratios.append(ordered[-third:].mean() / ordered[:third].mean())
-            correlations.append(spearmanr(width[:, dof], error[:, dof]).statistic)
-        return {
-            "width_ratio": float(np.mean(ratios)),
-            "rank_correlation": float(np.mean(correlations)),
-        }
+        return adaptiveness(
+            np.array([region.width() for region in regions]),
+            np.abs(self.seen.truth - self.seen.point),
+        )
 
     def volumes(self, regions: list[ConformalSet]) -> dict[str, Any]:
         """Return volumes of the joint sets of all frames, bounded, in standardised units."""

@@ -32,5 +32,7 @@ def read_json(path: Path, kind: type[T], what: str) -> T:
     """Read what ``write_json`` wrote; raises UsageError where it is not ``what`` it should be."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise UsageError(f"{path}: expected {what}, found {error}") from None
+    except OSError as error:
+        raise UsageError(f"{path}: expected {what}, found none: {error.strerror}") from None

@@ -95,9 +95,17 @@ def noisy(dataset: PoseDataset, noise: Noise, seed: int) -> PoseDataset:
 # -- kinds ----------------------------------------------------------------------------------------
 
 
+def _normal(image: Image, generator: np.random.Generator) -> NDArray[np.float32]:
+    """Draw standard normal numbers for every pixel and channel; a grey image has one channel."""
+    if (image == image[..., :1]).all():
+        grey = generator.standard_normal((*image.shape[:2], 1), dtype=np.float32)
+        return np.repeat(grey, image.shape[2], axis=2)
+    return generator.standard_normal(image.shape, dtype=np.float32)
+
+
 def _gaussian(image: Image, strength: float, generator: np.random.Generator) -> Image:
     """Return I + 255 s n, n standard normal in every pixel and channel: noise of the sensor."""
-    noise = generator.standard_normal(image.shape, dtype=np.float32)
+    noise = _normal(image, generator)
     # Both sums and products are rounded and cut at 0 and 255 by OpenCV.
     noisy = cv2.add(image, np.float32(255.0 * strength) * noise, dtype=cv2.CV_8U)
     return np.asarray(noisy, dtype=np.uint8)
@@ -114,7 +122,7 @@ def _salt_and_pepper(image: Image, strength: float, generator: np.random.Generat
 
 def _speckle(image: Image, strength: float, generator: np.random.Generator) -> Image:
     """Return I (1 + s n), n standard normal in every pixel and channel: bright places suffer."""
-    noise = generator.standard_normal(image.shape, dtype=np.float32)
+    noise = _normal(image, generator)
     noisy = cv2.multiply(image, 1.0 + np.float32(strength) * noise, dtype=cv2.CV_8U)
     return np.asarray(noisy, dtype=np.uint8)
 

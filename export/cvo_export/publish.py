@@ -135,7 +135,8 @@ def _draft(
     """Everything but score, thresholds and self-test."""
     config, target = run.config, run.target
     roles = run.split.roles
-    training = np.concatenate([roles["train"], roles["fit"]])
+    # Of all frames of these roles, also where a run was given a share: the unit of its score.
+    known = target.coordinates(run.dataset.poses[np.concatenate([roles["train"], roles["fit"]])])
     return Calibration(
         schema_version=1,
         name=name,
@@ -159,8 +160,8 @@ def _draft(
             rotation=run.graph.head.rotation,
             reference_q_xyzw=four(target.reference_q_xyzw),
             units=("m", "rad"),
-            limits=plausible(target.coordinates(run.dataset.poses[training])),
-            standard_deviation=six(target.std),
+            limits=plausible(known),
+            standard_deviation=six(known.std(axis=0)),
         ),
         thresholds=(),
         method_parameters={},

@@ -11,7 +11,7 @@ import hashlib
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,16 +20,19 @@ import msgspec
 from msgspec import Meta, Struct
 
 from cvo_edge.errors import UsageError
+from cvo_export.backbone import TIMM_WEIGHTS, Backbone, load_weights
 from cvo_export.bundle import versions
 from cvo_export.cells import CONFIDENCE, Cell, CellFolder, Say
 from cvo_export.configure import configure
 from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.datasets.describe import summary
 from cvo_export.files import write_json
 from cvo_export.frame_times import Timing, timed
 from cvo_export.noise import parse_noise
 from cvo_export.progress import Progress
 from cvo_export.run import TrainConfig
 from cvo_export.splits import Kind, default_kind
+from cvo_export.train import check_roles
 from cvo_export.workers import Engine
 
 RESULTS_FILE = "results.json"
@@ -65,7 +68,7 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
         As for ``train``.
     """
 
-    name: Annotated[str, Meta(min_length=1)]
+    name: Annotated[str, Meta(min_length=1, max_length=60)]
     data: Annotated[list[str], Meta(min_length=1)]
     methods: Annotated[list[str], Meta(min_length=1)]
     split: Kind | None = None
@@ -108,8 +111,9 @@ class Place(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Results(Struct, frozen=True, forbid_unknown_fields=True):
-    """What ``results.json`` holds: no path, and nothing that depends on where cells were run.
+    """What ``results.json`` holds: no path but those that the configuration names itself.
 
+    Seconds and milliseconds are of the machine; all else is the same wherever cells were run.
     ``data``: name of each data set -> as the configuration has it; two of one name are told apart
     by all of it. ``timing`` by name of the grid, of its first data set; milliseconds by cell.
     """
@@ -139,10 +143,11 @@ class _Plan(Struct):
 def read_study(path: Path) -> Study:
     """Read a configuration; raises UsageError where it is none."""
     try:
-        return msgspec.convert(tomllib.loads(path.read_text("utf-8")), Study)
+        return msgspec.convert(tomllib.loads(path.read_text("utf-8-sig")), Study)
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+    except (ValueError, RecursionError) as error:
+        # Of TOML, of its encoding, or of what it says.
         raise UsageError(f"{path}: expected a study, found {error}") from None
 
 
@@ -151,11 +156,16 @@ def run_study(
 ) -> Results:
     """Run the cells that are missing, time what is to be timed, and write ``results.json``.
 
-    Raises UsageError for a grid that cannot be, before anything is run; else as ``CellFolder.fill``
-    does, after all other cells have been run.
+    Raises UsageError before anything is run for a grid that cannot be, and for finished cells that
+    are of other data or weights; else as ``CellFolder.fill`` does, after all other cells have been
+    run.
     """
     opened = {text: open_dataset(expanded(text)) for grid in study.grids for text in grid.data}
+    for dataset in opened.values():
+        say(summary(dataset))
     plan = _plan(study, opened)
+    _check_networks(plan.configs.values())
+    folder.check_data(plan.configs)
     cells = folder.fill(plan.configs, plan.noises, engine, progress, say)
     results = Results(
         title=study.title,
@@ -185,26 +195,60 @@ def expanded(text: str) -> str:
 
 def _plan(study: Study, opened: Mapping[str, PoseDataset]) -> _Plan:
     plan = _Plan(_labels(opened), [], {}, {})
-    names = [grid.name for grid in study.grids]
+    names = [_file_safe(grid.name).lower() for grid in study.grids]
     if len(set(names)) < len(names):
-        raise UsageError(f"study: expected a name of its own for every grid, found {names}")
+        raise UsageError(
+            "study: expected a name of its own for every grid, in letters and digits alone, found "
+            + ", ".join(grid.name for grid in study.grids)
+        )
     for grid in study.grids:
-        noises = [str(parse_noise(text)) for text in grid.noises]
-        combinations = [dict(zip(grid.vary, v, strict=True)) for v in product(*grid.vary.values())]
-        for data, backbone, method, varied, seed in product(
-            grid.data, grid.backbones, grid.methods, combinations, range(grid.seeds)
-        ):
-            dataset = opened[data]
-            split = grid.split or default_kind(dataset)
-            config = _config(grid, data, split, backbone, method, varied, seed)
-            name = _cell_name(config, data, grid.weights, dataset.name)
-            plan.configs[name] = config
-            known = plan.noises.setdefault(name, [])
-            known += [noise for noise in noises if noise not in known]
-            plan.places.append(
-                Place(grid.name, name, plan.labels[data], split, backbone, method, seed, varied)
-            )
+        try:
+            _add(plan, grid, opened)
+        except UsageError as error:
+            raise UsageError(f"grid {grid.name}: {error}") from None
     return plan
+
+
+def _add(plan: _Plan, grid: Grid, opened: Mapping[str, PoseDataset]) -> None:
+    """Add the cells of a grid."""
+    noises = [str(parse_noise(text)) for text in grid.noises]
+    lists: dict[str, Sequence[Value]] = {
+        "data": grid.data,
+        "methods": grid.methods,
+        "backbones": grid.backbones,
+        "noises": noises,
+        **grid.vary,
+    }
+    for name, values in lists.items():
+        if len(set(values)) < len(values):
+            raise UsageError(f"{name}: expected each once, found {values}")
+    combinations = [dict(zip(grid.vary, v, strict=True)) for v in product(*grid.vary.values())]
+    for data, backbone, method, varied, seed in product(
+        grid.data, grid.backbones, grid.methods, combinations, range(grid.seeds)
+    ):
+        dataset = opened[data]
+        split = grid.split or default_kind(dataset)
+        config = _config(grid, data, split, backbone, method, varied, seed)
+        check_roles(config, dataset)
+        name = _cell_name(config, data, grid.weights, dataset.name)
+        plan.configs[name] = config
+        known = plan.noises.setdefault(name, [])
+        known += [noise for noise in noises if noise not in known]
+        plan.places.append(
+            Place(grid.name, name, plan.labels[data], split, backbone, method, seed, varied)
+        )
+
+
+def _check_networks(configs: Iterable[TrainConfig]) -> None:
+    """Raise UsageError for a backbone that cannot be built, or whose weights do not fit."""
+    distinct = {
+        msgspec.json.encode((c.backbone, c.height, c.width, c.weights)): c
+        for c in configs
+        # They would have to be fetched.
+        if c.weights != TIMM_WEIGHTS
+    }
+    for config in distinct.values():
+        load_weights(Backbone(config.backbone, config.height, config.width), config.weights)
 
 
 def _labels(opened: Mapping[str, PoseDataset]) -> dict[str, str]:
@@ -226,6 +270,14 @@ def _config(
 ) -> TrainConfig:
     network: dict[str, Any] = {"stages": grid.stages, "grid": grid.grid, "share": None}
     network |= {key: value for key, value in varied.items() if key in _OF_THE_NETWORK}
+    for name in ("stages", "grid"):
+        if not isinstance(network[name], str):
+            raise UsageError(f"{name}: expected text, found {network[name]!r}")
+    share = network["share"]
+    if share is not None:
+        if isinstance(share, str) or not 0.0 < share <= 1.0:
+            raise UsageError(f"share: expected above 0, at most 1, found {share!r}")
+        network["share"] = float(share)
     return configure(
         method=method,
         dataset=expanded(data),

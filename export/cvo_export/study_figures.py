@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_export.plot import BAND, POINT, TRUTH, Track, draw_dof, draw_from_above
+from cvo_export.plot import BAND, BOXES, MISSED, POINT, TRUTH, Track, draw_dof, draw_from_above
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
@@ -21,40 +22,112 @@ _LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _COLUMNS = 4
 # More hide one another and the flight.
 _TUBE_BOXES = 25
+# Of the flight's extent: boxes that are smaller cannot be told from its line.
+_VISIBLE = 0.06
+# Of the 90 % quantile of the widest method's sets.
+_REACH = 1.2
 
 
 def comparison(tracks: Mapping[str, Track]) -> Figure:
-    """Draw for each method the sets of x over the frames, and of x and y from above."""
-    figure = _figure(3.8 * len(tracks), 7.0)
-    axes = figure.subplots(2, len(tracks), squeeze=False)
+    """Draw for each method the sets of x over the frames and of x and y from above.
+
+    Each once as they are, and once about the truth, in centimetres, where widths can be seen.
+    """
+    figure = _figure(3.8 * len(tracks), 13.0)
+    axes = figure.subplots(4, len(tracks), squeeze=False)
+    reach = _REACH * max(_usual_reach(track) for track in tracks.values())
     for column, (method, track) in enumerate(tracks.items()):
         draw_dof(axes[0, column], track, 0)
-        draw_from_above(axes[1, column], track)
+        _draw_about_truth(axes[1, column], track, reach)
+        draw_from_above(axes[2, column], track)
+        _draw_plane_about_truth(axes[3, column], track, reach)
         axes[0, column].set_title(method)
         # All in the scale of the first, so that widths can be compared.
         axes[0, column].set_ylim(axes[0, 0].get_ylim())
-        axes[1, column].set_title("")
+        axes[2, column].set_title("")
     return figure
 
 
+def _usual_reach(track: Track) -> float:
+    """How far the ends of the sets of x are from the truth in nine of ten frames, centimetres."""
+    ends = [(track.estimates[r].lower[0], track.estimates[r].upper[0]) for r in track.rows]
+    distance = 100.0 * np.abs(np.array(ends) - track.truth[track.rows, :1])
+    bounded = distance[np.isfinite(distance)]
+    return float(np.quantile(bounded, 0.9)) if bounded.size else 100.0
+
+
+def _draw_about_truth(axes: Axes, track: Track, reach: float) -> None:
+    """Draw the set of x minus the truth over the frames, in centimetres."""
+    places, bottoms, heights, missed = [], [], [], []
+    for row in track.rows:
+        estimate, truth = track.estimates[row], track.truth[row, 0]
+        bands = estimate.bands[0] if estimate.bands else ((estimate.lower[0], estimate.upper[0]),)
+        for band in bands:
+            low, high = np.clip(100.0 * (np.array(band) - truth), -reach, reach)
+            places.append(row)
+            bottoms.append(low)
+            heights.append(high - low)
+        if not estimate.region.covers(track.truth[row])[0]:
+            missed.append(row)
+    axes.bar(places, heights, 1.0, bottoms, color=BAND, alpha=0.8, linewidth=0)
+    axes.axhline(0.0, color=TRUTH, linewidth=0.9)
+    axes.plot(missed, np.zeros(len(missed)), "x", color=MISSED, markersize=5)
+    axes.set_ylim(-reach, reach)
+    axes.set_ylabel("set of tx about the truth (cm)")
+    axes.set_xlabel("frame")
+    axes.margins(x=0.01)
+
+
+def _draw_plane_about_truth(axes: Axes, track: Track, reach: float) -> None:
+    """Draw the sets of x and y minus the truth as boxes, in centimetres."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Rectangle
+
+    boxes = []
+    for row in track.rows[:: max(1, len(track.rows) // BOXES)]:
+        plane = np.unique(track.estimates[row].position_boxes()[:, :2], axis=0)
+        plane = 100.0 * (plane - track.truth[row, :2][np.newaxis, :, np.newaxis])
+        if np.isfinite(plane).all():
+            boxes += [Rectangle((x[0], y[0]), x[1] - x[0], y[1] - y[0]) for x, y in plane]
+    axes.add_collection(PatchCollection(boxes, facecolor=BAND, edgecolor=POINT, alpha=0.2))
+    axes.plot(0.0, 0.0, "+", color=TRUTH, markersize=10)
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+    axes.set_aspect("equal")
+    axes.set_xlabel("tx about the truth (cm)")
+    axes.set_ylabel("ty about the truth (cm)")
+
+
 def tube(tracks: Mapping[str, Track]) -> Figure:
-    """Draw for each noise the boxes of x, y and z around the flight, all in one scale."""
+    """Draw for each noise the boxes of x, y and z around the flight, all in one scale.
+
+    Boxes that would be too small to see are drawn larger, all by one factor that the title states.
+    """
     rows = -(-len(tracks) // _COLUMNS)
     figure = _figure(4.2 * min(_COLUMNS, len(tracks)), 4.4 * rows)
     first = next(iter(tracks.values()))
     flight = first.truth[first.rows, :3]
     centre = 0.5 * (flight.min(axis=0) + flight.max(axis=0))
-    reach = 0.6 * (np.ptp(flight, axis=0) + _widths(first)).max()
+    extent = float(np.ptp(flight, axis=0).max())
+    width = _widths(first)
+    # Unbounded sets have none.
+    usual = float(width[np.isfinite(width)].mean()) if np.isfinite(width).any() else extent
+    times = max(1, int(_VISIBLE * extent / max(usual, 1e-9)))
+    reach = 0.6 * (extent + times * usual)
     for number, (name, track) in enumerate(tracks.items(), 1):
         axes = figure.add_subplot(rows, min(_COLUMNS, len(tracks)), number, projection="3d")
         for row in track.rows[:: max(1, len(track.rows) // _TUBE_BOXES)]:
-            _draw_box(axes, track.estimates[row].lower[:3], track.estimates[row].upper[:3])
+            low, high = track.estimates[row].lower[:3], track.estimates[row].upper[:3]
+            spare = 0.5 * (times - 1) * (high - low)
+            _draw_box(axes, low - spare, high + spare)
         axes.plot(*track.truth[track.rows, :3].T, color=TRUTH, linewidth=1.5)
-        width = 100 * _widths(track).mean()
-        axes.set_title(f"{name}: median width {width:.1f} cm", fontsize=10)
+        title = f"{name}: median width {100 * _widths(track).mean():.1f} cm"
+        axes.set_title(title + (f", drawn {times} times" if times > 1 else ""), fontsize=10)
         for axis, middle in zip("xyz", centre, strict=True):
             getattr(axes, f"set_{axis}lim")(middle - reach, middle + reach)
             getattr(axes, f"set_{axis}label")(f"{axis} (m)")
+            axes.locator_params(axis, nbins=4)
+        axes.set_box_aspect(None, zoom=0.85)
     return figure
 
 

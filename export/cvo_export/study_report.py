@@ -11,15 +11,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from cvo_edge.artifact import read_calibration
 from cvo_edge.errors import UsageError
-from cvo_export.cells import Cell, CellFolder, Figures
+from cvo_export.cells import CONFIDENCE, Cell, CellFolder, Figures
 from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.datasets.describe import summary
+from cvo_export.evaluate import coverage_band
 from cvo_export.files import write_whole
+from cvo_export.methods import TRAINABLE
 from cvo_export.noise import noisy, parse_noise
 from cvo_export.splits import make_split
 from cvo_export.study import Grid, Place, Results, Value, expanded
 
 if TYPE_CHECKING:
+    from jinja2 import Template
     from matplotlib.figure import Figure
 
 REPORT_FILE, PICTURES_FOLDER = "report.html", "pictures"
@@ -53,12 +58,8 @@ class Section(NamedTuple):
     pictures: Sequence[Picture]
 
 
-def write_report(results: Results, folder: CellFolder) -> Path:
-    """Write ``report.html`` and the pictures; returns the page.
-
-    Raises UsageError where matplotlib or jinja2 is not installed, SinkError where nothing can be
-    written.
-    """
+def page_template() -> Template:
+    """What the page is made with; raises UsageError where the packages for it are missing."""
     try:
         import matplotlib  # noqa: F401
         from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -66,15 +67,30 @@ def write_report(results: Results, folder: CellFolder) -> Path:
         raise UsageError(
             f'study: expected {error.name}, found none; pip install "cvo-export[plot]"'
         ) from None
-    report = _Report(results, folder)
     environment = Environment(
         loader=PackageLoader("cvo_export"), autoescape=True, undefined=StrictUndefined
     )
-    page = environment.get_template(REPORT_FILE).render(
+    return environment.get_template(REPORT_FILE)
+
+
+def write_report(results: Results, folder: CellFolder, template: Template) -> Path:
+    """Write ``report.html`` and the pictures; returns the page.
+
+    Raises SinkError where nothing can be written.
+    """
+    report = _Report(results, folder)
+    page = template.render(
         title=results.title,
         confidence=results.confidence,
         versions=results.versions,
         cells=len(results.cells),
+        data=[summary(report.dataset(label)) for label in results.data],
+        machines=sorted(
+            {
+                f"{timing.environment['cpu']}, {timing.threads} threads"
+                for timing in results.timing.values()
+            }
+        ),
         first=[report.table_one(grid) for grid in results.study.grids if not grid.vary],
         sections=[report.section(grid) for grid in results.study.grids],
     )
@@ -103,10 +119,14 @@ class _Report:
                 pictures += self.curves(grid, title, places)
             else:
                 tables.append(self.figures_table(title, places, ()))
-                tables += [self.noise_table(title, places)] if grid.noises else []
+                tables.append(self.coverage_table(title, places))
+            if grid.noises:
+                tables.append(self.noise_table(title, places, grid))
         if not grid.vary:
             pictures += self.sets(grid)
-        seeds = "one seed" if grid.seeds == 1 else f"{grid.seeds} seeds: medians, each in brackets"
+        seeds = "one seed"
+        if grid.seeds > 1:
+            seeds = f"{grid.seeds} seeds: medians, each seed's score in brackets"
         return Section(grid.name, f"{seeds}; weights {_source(grid.weights)}", tables, pictures)
 
     def places(self, grid: Grid) -> list[Place]:
@@ -123,9 +143,9 @@ class _Report:
         """Return a line for each backbone, method and value of the options that vary."""
         head = [
             *("backbone", "method", *varied),
-            *("coverage", "all six", "joint scope", "width", "score"),
-            *("own coverage", "own width", "own score", "point error"),
-            *("width hard/easy", "rank corr.", "train s", "M param.", "ms"),
+            *("coverage", "all six", "mean width", "score", "joint scope: all six", "volume^1/6"),
+            *("own coverage", "own mean width", "own score", "point error"),
+            *("width ratio", "rank corr.", "train s", "M param.", "MiB", "ms"),
         ]
         rows = []
         for key, of_key in _grouped(places, lambda p: (p.backbone, p.method, *p.varied.values())):
@@ -134,40 +154,73 @@ class _Report:
             rows.append(
                 [
                     *map(str, key),
-                    *_shown([cell.marginal for cell in cells])[:2],
+                    *_shown([cell.marginal for cell in cells]),
                     f"{_median(cell.joint.joint_coverage for cell in cells):.3f}",
-                    *_shown([cell.marginal for cell in cells])[2:],
+                    f"{_median(_side(cell) for cell in cells):.3f}",
                     *_own(own),
                     _error([cell.point_error for cell in cells]),
                     _adaptiveness(cells, "width_ratio"),
                     _adaptiveness(cells, "rank_correlation"),
                     _seconds(cells),
                     f"{cells[0].graph_parameters / 1e6:.2f}",
+                    f"{cells[0].model_bytes / 2**20:.1f}",
                     self.milliseconds(of_key),
                 ]
             )
         return Table(title, head, rows)
 
-    def noise_table(self, title: str, places: Sequence[Place]) -> Table:
-        """Return a line for each backbone, method and noise: both policies beside clean frames."""
+    def coverage_table(self, title: str, places: Sequence[Place]) -> Table:
+        """Return a line a run: coverage of each degree of freedom, and the band it has to be in.
+
+        Frames of a random split are exchangeable; of other splits no band holds, and none is shown.
+        """
         head = [
-            *("backbone", "method", "noise", "point error"),
-            *("thresholds of clean frames: coverage", "all six", "width", "score"),
-            *("recalibrated: coverage", "all six", "width", "score"),
+            *("backbone", "method", "seed", "coverage: tx", "ty", "tz", "rx", "ry", "rz"),
+            *("joint scope: all six", "99 % band", "calibration, test frames"),
         ]
         rows = []
-        for (backbone, method), of_key in _grouped(places, lambda p: (p.backbone, p.method)):
-            cells = [self.cell(place) for place in of_key]
+        for place in places:
+            cell = self.cell(place)
+            frames = cell.frames["total"] - cell.frames["invalid"]
+            n = read_calibration(self.folder.bundle(place.cell)).calibration.n
+            band = coverage_band(n, frames, CONFIDENCE) if place.split == "random" else None
+            rows.append(
+                [
+                    *(place.backbone, place.method, str(place.seed)),
+                    *(f"{value:.3f}" for value in cell.marginal.coverage),
+                    f"{cell.joint.joint_coverage:.3f}",
+                    "none" if band is None else f"{band[0]:.3f} to {band[1]:.3f}",
+                    f"{n}, {frames}",
+                ]
+            )
+        return Table(f"{title}: run by run", head, rows)
+
+    def noise_table(self, title: str, places: Sequence[Place], grid: Grid) -> Table:
+        """Return a line for each backbone, method, value that varies and noise: both policies."""
+        head = [
+            *("backbone", "method", *grid.vary, "noise", "invalid", "point error"),
+            *("thresholds of clean frames: coverage", "all six", "mean width", "score"),
+            *("recalibrated: coverage", "all six", "mean width", "score"),
+        ]
+        rows = []
+        for key, of_key in _grouped(places, lambda p: (p.backbone, p.method, *p.varied.values())):
+            cells, named = [self.cell(place) for place in of_key], [str(value) for value in key]
             clean = _shown([cell.marginal for cell in cells])
             error = _error([cell.point_error for cell in cells])
-            rows.append([backbone, method, "none", error, *clean, *clean])
-            for name in cells[0].noise:
-                noise = [cell.noise[name] for cell in cells]
+            invalid = _share_invalid(cells, [cell.frames["invalid"] for cell in cells])
+            rows.append([*named, "none", invalid, error, *clean, *clean])
+            for name in _noises(grid):
+                found = [cell.noise[name] for cell in cells]
+                noise = [figures for figures in found if figures is not None]
+                if len(noise) < len(found):
+                    rows.append([*named, name, "all of a seed's frames", *(["-"] * 9)])
+                    continue
                 rows.append(
                     [
-                        *(backbone, method, name, _error([found.point_error for found in noise])),
-                        *_shown([found.clean for found in noise]),
-                        *_shown([found.recalibrated for found in noise]),
+                        *(*named, name, _share_invalid(cells, [n.invalid for n in noise])),
+                        _error([figures.point_error for figures in noise]),
+                        *_shown([figures.clean for figures in noise]),
+                        *_shown([figures.recalibrated for figures in noise]),
                     ]
                 )
         return Table(f"{title}, with noise", head, rows)
@@ -182,11 +235,12 @@ class _Report:
         ]
         columns = _grouped(places, lambda place: (place.method,))
         cells = {key[0]: [self.cell(place) for place in found] for key, found in columns}
-        shares = self.by_share(first)
+        shares = self.by_share(grid, first)
+        sharpness = self.sharpness(grid, first)
         joint_sets = {"mcqr": "six at once, a region"}
 
-        def row(name: str, figure: Callable[[str], str]) -> list[str]:
-            return [name, *(figure(method) for method in cells)]
+        def row(name: str, figure: Callable[[str], str | None]) -> list[str]:
+            return [name, *(figure(method) or "-" for method in cells)]
 
         ms = {method: self.milliseconds(found) for (method,), found in columns}
         return Table(
@@ -204,8 +258,12 @@ class _Report:
                     lambda m: f"{cells[m][0].graph_parameters / 1e6:.2f}",
                 ),
                 row(
-                    "interval calibration: own coverage over lambda 0 to 1",
-                    lambda m: self.tunable(first, m),
+                    "complexity: MiB of the model",
+                    lambda m: f"{cells[m][0].model_bytes / 2**20:.1f}",
+                ),
+                *(
+                    row(f"interval calibration: own coverage at lambda {value:g}", found.get)
+                    for value, found in sharpness.items()
                 ),
                 row(
                     "interval adaptiveness: width on frames of large over small errors",
@@ -220,36 +278,49 @@ class _Report:
                     lambda m: _shown([cell.marginal for cell in cells[m]])[3],
                 ),
                 row("training time: processor seconds", lambda m: _seconds(cells[m])),
-                row(
-                    "data dependency: score at "
-                    + ", ".join(f"{100 * share:g} %" for share in shares),
-                    lambda m: ", ".join(s[m] for s in shares.values() if m in s) or "-",
+                *(
+                    row(f"data dependency: score at {100 * share:g} % of the frames", found.get)
+                    for share, found in shares.items()
                 ),
             ],
         )
 
-    def by_share(self, first: Place) -> dict[float, dict[str, str]]:
-        """Share of the training frames -> method -> score, on the data of a place."""
+    def by_share(self, grid: Grid, first: Place) -> dict[float, dict[str, str]]:
+        """Share of the training frames -> method -> score, median over seeds."""
         found: dict[float, dict[str, str]] = {}
-        for grid in self.results.study.grids:
-            if set(grid.vary) == {"share"}:
-                places = [p for p in self.places(grid) if p.data == first.data]
-                for (share, method), group in _grouped(
-                    places, lambda p: (p.varied["share"], p.method)
-                ):
-                    scores = [self.cell(p).marginal.normalised_interval_score for p in group]
-                    found.setdefault(float(share), {})[str(method)] = f"{_median(scores):.3f}"
+        for place, cells in self.varied(grid, first, "share"):
+            scores = [cell.marginal.normalised_interval_score for cell in cells]
+            found.setdefault(float(place.varied["share"]), {})[place.method] = (
+                f"{_median(scores):.3f}{_seeds(cells)}"
+            )
         return dict(sorted(found.items()))
 
-    def tunable(self, first: Place, method: str) -> str:
-        """Range of the own bounds' coverage over lambda; the others have nothing to tune."""
-        coverages = [
-            cell.own.mean_coverage
-            for place in self.results.places
-            if (place.data, place.method) == (first.data, method) and "sharpness" in place.varied
-            if (cell := self.cell(place)).own is not None
-        ]
-        return f"{min(coverages):.2f} to {max(coverages):.2f}" if coverages else "-"
+    def sharpness(self, grid: Grid, first: Place) -> dict[float, dict[str, str]]:
+        """Lambda -> method -> coverage of the own bounds, all else at its default."""
+        found: dict[float, dict[str, str]] = {}
+        for place, cells in self.varied(grid, first, "sharpness"):
+            own = [cell.own.mean_coverage for cell in cells if cell.own is not None]
+            if own:
+                found.setdefault(float(place.varied["sharpness"]), {})[place.method] = (
+                    f"{_median(own):.3f}{_seeds(cells)}"
+                )
+        return dict(sorted(found.items()))
+
+    def varied(self, grid: Grid, first: Place, option: str) -> list[tuple[Place, list[Cell]]]:
+        """Cells in which one option varies and all else is as in a grid's first place.
+
+        A place of each value and method, and its cells of all seeds. Other options that vary with
+        it are at the value that the method has by itself.
+        """
+        groups: dict[tuple[str, Value], list[Place]] = {}
+        for other in self.results.study.grids:
+            if option not in other.vary or _setting(other) != _setting(grid):
+                continue
+            for place in self.places(other):
+                kin = (place.data, place.split, place.backbone)
+                if kin == (first.data, first.split, first.backbone) and _by_itself(place, option):
+                    groups.setdefault((place.method, place.varied[option]), []).append(place)
+        return [(places[0], [self.cell(p) for p in places]) for places in groups.values()]
 
     def milliseconds(self, places: Sequence[Place]) -> str:
         """Median of a frame, of the cell that was timed."""
@@ -275,15 +346,16 @@ class _Report:
                 self.picture(
                     f"sets-{grid.name}-{data}-{backbone}",
                     comparison(drawn),
-                    f"{data}, {backbone}: sets of x over test frames, and of x and y, 0.9 marginal",
+                    f"{data}, {backbone}: sets of 0.9, of x over the test frames and of x and y, "
+                    "as they are and about the truth; crosses are frames that a set missed",
                 )
             )
             if _TUBE_METHOD not in bundles or not grid.noises:
                 continue
             tracks = {"none": drawn[_TUBE_METHOD]}
-            for noise in map(parse_noise, grid.noises):
-                worse = noisy(dataset, noise, of_key[0].seed)
-                tracks[noise.name] = track(bundles[_TUBE_METHOD], worse, sequence=shown)
+            for name in _noises(grid):
+                worse = noisy(dataset, parse_noise(name), of_key[0].seed)
+                tracks[name] = track(bundles[_TUBE_METHOD], worse, sequence=shown)
             pictures.append(
                 self.picture(
                     f"tube-{grid.name}-{data}-{backbone}",
@@ -299,7 +371,14 @@ class _Report:
         from cvo_export.study_figures import curves
 
         option = next(iter(grid.vary))
-        values: list[Value] = grid.vary[option]
+        drawn = curves(option, grid.vary[option], self.panels(option, grid.vary[option], places))
+        name = f"curves-{grid.name}-{places[0].data}"
+        return [self.picture(name, drawn, f"{title}: {option}")]
+
+    def panels(
+        self, option: str, values: Sequence[Value], places: Sequence[Place]
+    ) -> dict[str, dict[str, list[float]]]:
+        """Panel -> line -> a figure for each value of an option, median over seeds."""
         panels: dict[str, dict[str, list[float]]] = {
             "coverage, own bounds": {},
             "coverage, calibrated": {},
@@ -307,11 +386,16 @@ class _Report:
             "mean width, calibrated (cm)": {},
             "score, calibrated": {},
         }
+        backbones = {place.backbone for place in places}
         for key, of_key in _grouped(
             places,
-            lambda p: (p.method, *(v for k, v in p.varied.items() if k != option)),
+            lambda p: (
+                *((p.backbone,) if len(backbones) > 1 else ()),
+                p.method,
+                *(f"{k} {v}" for k, v in p.varied.items() if k != option),
+            ),
         ):
-            label = " ".join(map(str, key))
+            label = ", ".join(key)
             for value in values:
                 cells = [self.cell(p) for p in of_key if p.varied[option] == value]
                 own = [cell.own for cell in cells if cell.own is not None]
@@ -324,11 +408,9 @@ class _Report:
                 )
                 for panel, figure in zip(panels.values(), found, strict=True):
                     panel.setdefault(label, []).append(figure)
-        drawn = {
+        return {
             name: lines for name, lines in panels.items() if np.isfinite([*lines.values()]).any()
         }
-        name = f"curves-{grid.name}-{places[0].data}"
-        return [self.picture(name, curves(option, values, drawn), f"{title}: {option}")]
 
     def picture(self, name: str, figure: Figure, caption: str) -> Picture:
         """Write a picture as a file, and return it for the page."""
@@ -344,6 +426,42 @@ class _Report:
         if label not in self._opened:
             self._opened[label] = open_dataset(expanded(self.results.data[label]))
         return self._opened[label]
+
+
+def _setting(grid: Grid) -> tuple[str, ...]:
+    """What two grids must share for their cells to differ in nothing but what varies."""
+    training = (grid.copies, grid.steps, grid.fine_tune)
+    return (grid.weights, grid.size, grid.stages, grid.grid, *map(str, training))
+
+
+def _by_itself(place: Place, option: str) -> bool:
+    """Whether all that varies in a place but this option is at the method's own value."""
+    known = TRAINABLE[place.method].config()
+    return all(
+        getattr(known, name, None) == value
+        for name, value in place.varied.items()
+        if name != option
+    )
+
+
+def _side(cell: Cell) -> float:
+    """Edge of a box of the joint sets' volume, in standard deviations."""
+    return float(cell.joint_volume["geometric_mean"] ** (1 / 6))
+
+
+def _seeds(cells: Sequence[Cell]) -> str:
+    return " (one seed)" if len(cells) == 1 else ""
+
+
+def _noises(grid: Grid) -> list[str]:
+    """Noises of a grid by the names that cells have them under."""
+    return list(dict.fromkeys(str(parse_noise(text)) for text in grid.noises))
+
+
+def _share_invalid(cells: Sequence[Cell], invalid: Sequence[int]) -> str:
+    """Median share of the test frames that did not pass the checks."""
+    totals = [cell.frames["total"] for cell in cells]
+    return f"{100 * _median(np.divide(invalid, totals).tolist()):.1f} %"
 
 
 def _grouped(

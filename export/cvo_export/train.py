@@ -28,14 +28,14 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cvo_edge.errors import UsageError
 from cvo_export.backbone import Backbone, load_weights
-from cvo_export.datasets import open_dataset
+from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.features import FeatureExtractor, ModelImages, cached_copies, cached_features
 from cvo_export.heads import Setting
 from cvo_export.heads.base import Examples, L, Learner
 from cvo_export.methods import TRAINABLE
 from cvo_export.progress import Progress
 from cvo_export.run import History, PoseGraph, Run, TrainConfig, claim_run, open_run
-from cvo_export.splits import deal_folds, make_split, training_frames
+from cvo_export.splits import Split, deal_folds, make_split, training_frames
 from cvo_export.target import Target, fit_target
 
 Array = NDArray[np.float64]
@@ -66,11 +66,7 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     to decide anything.
     """
     dataset, split = open_run(run_dir, config)
-    if split.roles["val"].size < _LEAST_VAL:
-        raise UsageError(
-            f"{config.dataset}: expected at least {_LEAST_VAL} frames of the role val, which "
-            f"decides by intervals of 0.9, found {split.roles['val'].size}"
-        )
+    _check_val(config, split)
     torch.manual_seed(config.seed)
     backbone = Backbone(config.backbone, config.height, config.width)
     weights_sha256 = load_weights(backbone, config.weights)
@@ -103,6 +99,19 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     run = Run(config, dataset, split, target, graph, weights_sha256, trainer.history)
     run.save(run_dir)
     return run
+
+
+def check_roles(config: TrainConfig, dataset: PoseDataset) -> None:
+    """Raise UsageError where a run's data set cannot be split, or val is too small to decide."""
+    _check_val(config, make_split(dataset, config.split, config.seed))
+
+
+def _check_val(config: TrainConfig, split: Split) -> None:
+    if split.roles["val"].size < _LEAST_VAL:
+        raise UsageError(
+            f"{config.dataset}: expected at least {_LEAST_VAL} frames of the role val, which "
+            f"decides by intervals of 0.9, found {split.roles['val'].size}"
+        )
 
 
 def prepare_features(config: TrainConfig, cache: Path, progress: Progress) -> None:

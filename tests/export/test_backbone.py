@@ -47,7 +47,9 @@ def test_pooling_of_a_constant_map_is_constant_on_every_grid():
 @pytest.mark.parametrize(
     ("changes", "rule"),
     [
-        ({"name": "no_such_net"}, "backbone"),
+        ({"name": "no_such_net"}, "backbone: expected a model of timm, found no_such_net"),
+        ({"name": "a/b"}, "backbone: expected a model of timm, found a/b"),
+        ({"name": "local-dir:/none"}, "backbone: expected a model of timm, found local-dir"),
         ({"stages": ("7",)}, "stages: expected some of 2, 4, 8, 16, 32"),
         ({"stages": ("final", "16")}, "stages"),
         ({"grid": (9, 9)}, "grid: expected at most 4x6"),

@@ -16,6 +16,7 @@ from cvo_export.datasets.euroc import open_euroc
 DATA = Path(__file__).parent / "data" / "euroc"
 # The same stamps as in groundtruth.csv, some of which are off by a few nanoseconds.
 FIRST_NS, STEP_NS = 1403715274302142976, 5_000_000
+ONES = ("[" + "1, " * 99)[:80]
 IDENTITY = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
 
 
@@ -104,6 +105,14 @@ def test_the_first_line_of_opencv_is_passed_over(tmp_path):
     assert open_euroc(str(folder)).intrinsics == (40.5, 40.25, 31.5, 24.75)
 
 
+@pytest.mark.parametrize("number", [".nan", "-40.5"])
+def test_intrinsics_of_no_camera_are_refused(tmp_path, number):
+    folder = recording(tmp_path / "a", stamps(1))
+    edit(sensor(folder), "40.5", number)
+    with pytest.raises(SourceError, match=r"sensor.yaml: expected intrinsics of a camera, found"):
+        open_euroc(str(folder))
+
+
 def test_a_fisheye_is_no_pinhole(tmp_path):
     folder = recording(tmp_path / "a", stamps(1))
     edit(sensor(folder), "radial-tangential", "equidistant")
@@ -161,6 +170,9 @@ def test_recordings_of_one_room_are_one_data_set(tmp_path):
     [
         ("\t: [", "YAML with T_BS and intrinsics, found none"),
         ("text", "YAML with T_BS and intrinsics, found none"),
+        ("date: 2014-13-45", "YAML with T_BS and intrinsics, found none"),
+        ("[" * 3000, "YAML with T_BS and intrinsics, found none"),
+        (f"T_BS: [{', '.join('1' * 99)}]", f"T_BS, 16 numbers of a rigid motion, found {ONES}"),
         ("a: 1", "T_BS, 16 numbers of a rigid motion, found None"),
         ("T_BS: [1, 2]", "T_BS, 16 numbers of a rigid motion, found [1, 2]"),
         (
@@ -192,6 +204,7 @@ def test_a_sensor_that_is_missing_is_refused(tmp_path):
     ("file", "line", "expected"),
     [
         ("cam0", "12", "timestamp,filename, found '12' in line 2"),
+        ("cam0", "1" * 5000 + ",a.png", f"timestamp,filename, found {'1' * 80!r} in line 2"),
         ("cam0", "1.5,a.png", "timestamp,filename, found '1.5 a.png' in line 2"),
         (
             "state_groundtruth_estimate0",

@@ -136,6 +136,7 @@ def test_nothing_but_the_calibration_is_refused(tmp_path):
         ("sequences/00/calib.txt", "P0:" + " 1" * 12, "a line P2:, found P0:"),
         ("sequences/00/calib.txt", "P2:" + " 0" * 12, None),
         ("sequences/00/calib.txt", "P2:" + " x" * 12, None),
+        ("sequences/00/calib.txt", "P2: 1 1 0 0 1 1 0 0 0 0 1 0", None),
     ],
 )
 def test_a_malformed_file_is_refused_with_its_line(tmp_path, file, text, expected):

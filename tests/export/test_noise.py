@@ -92,11 +92,20 @@ def test_a_noisy_data_set_has_the_frames_and_splits_of_the_clean_one():
 
 @pytest.mark.parametrize("strength", [0.02, 0.1])
 def test_gaussian_has_its_deviation_about_the_level(strength):
-    difference = degraded(f"gaussian:{strength}", grey(128)).astype(float) - 128
+    image = grey(128)
+    image[0, 0, 0] = 127  # a colour
+    difference = degraded(f"gaussian:{strength}", image).astype(float) - 128
     assert difference.std() == pytest.approx(255 * strength, rel=0.01)
     assert abs(difference.mean()) < 0.2
     channels = np.corrcoef(difference.reshape(-1, 3).T)
     assert np.abs(channels - np.eye(3)).max() < 0.02
+
+
+@pytest.mark.parametrize("name", ["gaussian", "speckle"])
+def test_a_grey_camera_has_one_channel_of_noise(name):
+    found = degraded(name, grey(128))
+    assert found.std() > 1.0
+    assert (found == found[..., :1]).all()
 
 
 @pytest.mark.parametrize("strength", [0.05, 0.3, 1.0])

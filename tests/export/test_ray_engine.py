@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cvo_edge.errors import UsageError
-from cvo_export.ray_engine import run_tasks_on_ray
+from cvo_export.ray_engine import ray_engine
 
 pytest.importorskip("ray")
 
@@ -55,18 +55,48 @@ def die_once(path):
     path.write_text("twice")
 
 
-def test_outcomes_are_those_of_the_tasks_and_a_killed_worker_is_run_again(cluster, tmp_path):
+def test_outcomes_are_those_of_the_tasks_and_a_killed_worker_is_run_again(
+    cluster, tmp_path, monkeypatch
+):
     tasks = {
         "write": partial(write, tmp_path / "written", "by a worker"),
         "refuse": refuse,
         "die": partial(die_once, tmp_path / "died"),
+        "where": partial(write, Path("relative"), "to the folder of the study"),
     }
+    monkeypatch.chdir(tmp_path)
     found = {}
-    run_tasks_on_ray(tasks, found.__setitem__)
+    before = signal.getsignal(signal.SIGTERM)
+    with ray_engine() as run:
+        # Our programs leave with their own exit codes.
+        assert signal.getsignal(signal.SIGTERM) == before
+        run(tasks, found.__setitem__)
     assert set(found) == set(tasks)
     assert found["write"] is None
     assert (tmp_path / "written").read_text() == "by a worker"
+    assert (tmp_path / "relative").read_text() == "to the folder of the study"
     assert type(found["refuse"]) is UsageError
     assert str(found["refuse"]) == "no"
     assert found["die"] is None
     assert (tmp_path / "died").read_text() == "twice"
+
+
+@pytest.mark.parametrize(
+    "address", ["127.0.0.1:9", "nonsense", "ray://127.0.0.1:10001", "127.0.0.1:99999999"]
+)
+def test_an_address_where_no_cluster_is_is_refused_at_once(address, monkeypatch):
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(UsageError, match=f"a Ray cluster at {address}, found none"), ray_engine():
+        raise AssertionError
+
+
+def test_no_address_at_all_is_refused(monkeypatch, tmp_path):
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    with pytest.raises(UsageError, match="any address, found none; start one"), ray_engine():
+        raise AssertionError
+    # What a head that was killed leaves.
+    (tmp_path / "ray").mkdir()
+    (tmp_path / "ray" / "ray_current_cluster").write_text("127.0.0.1:9")
+    with pytest.raises(UsageError, match=r"at 127.0.0.1:9, found none"), ray_engine():
+        raise AssertionError

@@ -50,6 +50,8 @@ def test_own_lists_name_sequences_by_number(tmp_path):
     (root / "TestSplit.txt").write_text("sequence2\nsequence9\n")
     found = open_seven_scenes(str(root))
     assert (found.own_train, found.own_test) == ({0, 2}, {1})
+    (root / "TrainSplit.txt").write_text("\ufeffsequence3\n", "utf-8")
+    assert open_seven_scenes(str(root)).own_train == {2}
 
 
 def test_intrinsics_are_read_or_scaled_from_the_nominal_ones(tmp_path):
@@ -60,6 +62,9 @@ def test_intrinsics_are_read_or_scaled_from_the_nominal_ones(tmp_path):
     assert open_seven_scenes(str(root)).intrinsics == (50, 51, 31, 23)
     (root / "camera-intrinsics.txt").write_text("50 0")
     with pytest.raises(SourceError, match="nine numbers"):
+        open_seven_scenes(str(root))
+    (root / "camera-intrinsics.txt").write_text("-50 0 31\n0 51 23\n0 0 1\n")
+    with pytest.raises(SourceError, match="expected intrinsics of a camera"):
         open_seven_scenes(str(root))
 
 

@@ -1,5 +1,6 @@
 """A study: every cell once, the same wherever its files are, and a page that needs no other."""
 
+import fcntl
 import json
 import re
 import shutil
@@ -15,8 +16,8 @@ from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.noise import parse_noise
 from cvo_export.splits import make_split, training_frames
-from cvo_export.study import Study, expanded, read_study, run_study
-from cvo_export.study_report import write_report
+from cvo_export.study import _plan, expanded, read_study, run_study
+from cvo_export.study_report import page_template, write_report
 from cvo_export.workers import run_tasks
 
 from .conftest import DATASET, ignore_progress
@@ -55,7 +56,7 @@ def studied(tmp_path_factory):
         study = read_study(folder / "study.toml")
         cell_folder = CellFolder(folder / "out", folder / "out" / "features")
         results = run_study(study, cell_folder, engine, ignore_progress, said.append)
-        page = write_report(results, cell_folder)
+        page = write_report(results, cell_folder, page_template())
     return cell_folder, study, results, page, said
 
 
@@ -66,7 +67,8 @@ def engine(tasks, ended):
 def test_a_cell_of_two_grids_is_run_once(studied):
     folder, _, results, _, said = studied
     # Sharpness 0.5 is what seed 0 of the first grid has anyway.
-    assert len(said) == len(results.cells) == len(list((folder.out / "cells").iterdir())) == 3
+    assert len(said) == 1 + 3  # the data set, and each cell
+    assert len(results.cells) == len(list((folder.out / "cells").iterdir())) == 3
     assert len(results.places) == 4
     first, _, default, other = results.places
     assert (first.cell, default.varied) == (default.cell, {"sharpness": 0.5})
@@ -81,7 +83,7 @@ def test_a_finished_study_runs_nothing(studied, monkeypatch):
     monkeypatch.setattr(cells, "evaluate", None)
     said = []
     again = run_study(study, folder, engine, ignore_progress, said.append)
-    assert said == []
+    assert len(said) == 1
     assert again == results
 
 
@@ -101,6 +103,46 @@ def test_a_noise_that_is_new_is_evaluated_without_training(studied, monkeypatch,
     )
     assert set(grown.cells[results.places[0].cell].noise) == {"speckle:0.3", "exposure:-2.0"}
     assert folder.cell(name).read_bytes() == before
+
+
+def test_cells_of_other_data_are_refused(studied, monkeypatch):
+    folder, study, _, _, _ = studied
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET.replace("flights=", "seed=7,flights="))
+    with pytest.raises(UsageError, match=r"cells/.*: expected a cell of synthetic:"):
+        run_study(study, folder, engine, ignore_progress, [].append)
+
+
+def test_a_folder_is_filled_by_one_program_at_a_time(studied, monkeypatch):
+    folder, study, _, _, _ = studied
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET)
+    with (folder.out / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(UsageError, match="found one in use"):
+            run_study(study, folder, engine, ignore_progress, [].append)
+
+
+@pytest.mark.parametrize("content", [b'{"method": "\xff"}', b"{}", b"[" * 5000])
+def test_a_damaged_cell_is_named(studied, monkeypatch, tmp_path, content):
+    known, study, results, _, _ = studied
+    folder = CellFolder(shutil.copytree(known.out, tmp_path / "out"), known.features)
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET)
+    damaged = folder.cell(results.places[0].cell)
+    damaged.write_bytes(content)
+    with pytest.raises(UsageError) as caught:
+        run_study(study, folder, engine, ignore_progress, [].append)
+    assert str(caught.value).startswith(f"{damaged}: expected the figures of a cell, found ")
+    assert "\n" not in str(caught.value)
+
+
+def test_fine_tuning_is_part_of_the_training_time(monkeypatch):
+    now = iter([0.0, 10.0, 25.0, 30.0])
+    monkeypatch.setattr(cells, "process_time", lambda: next(now))
+    monkeypatch.setattr(cells, "perf_counter", lambda: 0.0)
+    clock = cells._Clock()
+    clock("features", 2, 2)
+    # Features of the backbone as it has learnt.
+    clock("features", 2, 2)
+    assert clock.seconds().processor == 25.0 - 10.0
 
 
 def test_a_cell_holds_what_evaluate_says_of_its_bundle(studied):
@@ -156,7 +198,19 @@ def test_names_of_cells_depend_on_no_place(studied, monkeypatch, tmp_path):
     [
         ("title = 1", "expected a study"),
         (CONFIG.replace("steps", "stepz"), "unknown field `stepz`"),
-        (CONFIG.replace('"sharpness"', '"methods"'), "a name of its own for every grid"),
+        (CONFIG.replace('"sharpness"', '"METHODS"'), "a name of its own for every grid"),
+        (CONFIG.replace("sharpness = [0.5", "stages = [4"), "stages: expected text, found 4"),
+        (CONFIG.replace("sharpness = [0.5, 1.0]", "grid = [3]"), "grid: expected text, found 3"),
+        (CONFIG.replace("sharpness = [0.5", 'share = ["half"'), "share: expected above 0"),
+        (CONFIG.replace("sharpness = [0.5", "share = [0.0"), "share: expected above 0"),
+        (CONFIG.replace("sharpness = [0.5", "share = [nan"), "share: expected above 0"),
+        (CONFIG.replace("sharpness = [0.5, 1.0]", "share = [1, 1.0]"), "share: expected each once"),
+        (CONFIG.replace("sharpness = [0.5", "kl_weight = [inf"), "expected a finite number"),
+        (CONFIG.replace("sharpness = [0.5", "dropout = [2.0"), "grid sharpness: .*dropout"),
+        (CONFIG.replace('["cjp"]', '["cjp", "cjp"]'), "methods: expected each once"),
+        (CONFIG.replace('"none"', '"/nowhere.safetensors"'), "expected a safetensors file"),
+        (CONFIG.replace("copies", 'backbones = ["a/b"]\ncopies'), "expected a model of timm"),
+        (CONFIG.replace("$CVO_TEST_DATA", DATASET.split(",")[0] + ",flights=1,frames=20"), "val"),
         (CONFIG.replace("speckle:0.3", "rain"), "expected NAME or NAME:STRENGTH"),
         (CONFIG.replace('["cjp"]', '["abc"]'), "expected one of cjp"),
         (CONFIG.replace("sharpness = [0.5", "classes = [4"), "expected an option of cjp"),
@@ -197,6 +251,28 @@ def test_two_data_sets_of_one_name_are_told_apart(monkeypatch, tmp_path):
     assert len(names) == 6
 
 
+def planned(text, folder, monkeypatch):
+    """Results of a study whose cells are not there: places and labels alone."""
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET)
+    (folder / "study.toml").write_text(text)
+    study = read_study(folder / "study.toml")
+    opened = {text: open_dataset(expanded(text)) for grid in study.grids for text in grid.data}
+    plan = _plan(study, opened)
+    return study, plan
+
+
+def test_labels_tell_data_sets_of_one_name_apart(monkeypatch, tmp_path):
+    other = f"{DATASET},seed=1"
+    text = CONFIG.replace('data = ["$CVO_TEST_DATA"]', f'data = ["$CVO_TEST_DATA", "{other}"]')
+    _, plan = planned(text, tmp_path, monkeypatch)
+    name = open_dataset(DATASET).name
+    assert plan.labels == {
+        "$CVO_TEST_DATA": f"{name} ($CVO_TEST_DATA)",
+        other: f"{name} ({other})",
+    }
+    assert {place.data for place in plan.places} == set(plan.labels.values())
+
+
 def test_variables_are_replaced(monkeypatch):
     monkeypatch.setenv("CVO_TEST_DATA", "place")
     assert expanded("7scenes:$CVO_TEST_DATA/a") == expanded("7scenes:${CVO_TEST_DATA}/a")
@@ -221,8 +297,13 @@ def test_a_share_of_the_training_frames_is_a_part_of_a_larger_one(kind):
             assert larger.tolist() == whole.tolist()
 
 
-def test_the_configurations_that_come_with_the_project_are_read(request, monkeypatch):
-    folder = request.config.rootpath / "bench" / "study"
-    found = [read_study(path) for path in sorted(folder.glob("*.toml"))]
-    assert len(found) == 2
-    assert all(isinstance(study, Study) for study in found)
+@pytest.mark.parametrize(("name", "cells"), [("small", 10), ("full", 62)])
+def test_the_configurations_that_come_with_the_project_can_be(name, cells, request, monkeypatch):
+    """On any data with as many sequences: methods, options, noises and names are good ones."""
+    monkeypatch.setenv("CVO_DATA", "of-another-place")
+    monkeypatch.setenv("CVO_WEIGHTS", "of-another-place")
+    study = read_study(request.config.rootpath / "bench" / "study" / f"{name}.toml")
+    stand_in = open_dataset("synthetic:room,flights=20,frames=10,size=64x48")
+    monkeypatch.setattr("cvo_export.configure.open_dataset", lambda _: stand_in)
+    opened = {text: stand_in for grid in study.grids for text in grid.data}
+    assert len(_plan(study, opened).configs) == cells

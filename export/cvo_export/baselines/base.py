@@ -10,10 +10,10 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from statistics import NormalDist
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -53,7 +53,7 @@ class TrunkConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     hidden: tuple[int, int] = (256, 128)
-    feature_noise: float = 0.1
+    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
 
 
 class IntervalNetwork(Learner):

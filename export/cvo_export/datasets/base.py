@@ -18,6 +18,11 @@ class Intrinsics(NamedTuple):
     cx: float
     cy: float
 
+    @property
+    def possible(self) -> bool:
+        """Whether there can be such a camera: finite numbers, positive focal lengths."""
+        return bool(np.isfinite(self).all()) and self.fx > 0.0 and self.fy > 0.0
+
     def scaled(self, factor: float) -> Intrinsics:
         """Return the same camera for images ``factor`` times as large."""
         return Intrinsics(*(factor * value for value in self))

@@ -85,19 +85,24 @@ def _read_camera(path: Path) -> tuple[Intrinsics | None, Array]:
     text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
     try:
         document: Any = yaml.safe_load(text)
-    except yaml.YAMLError:
+    # A date that is none and brackets without end are errors of other kinds.
+    except (yaml.YAMLError, ValueError, RecursionError):
         document = None
     if not isinstance(document, dict):
         raise SourceError(f"{path}: expected YAML with T_BS and intrinsics, found none")
     T_BS = document.get("T_BS")
     matrix = _numbers(T_BS.get("data") if isinstance(T_BS, dict) else T_BS, 16)
     if matrix is None or matrix_to_pose(matrix.reshape(4, 4)) is None:
-        raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid motion, found {T_BS}")
+        found = " ".join(str(T_BS).split())[:80]
+        raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid motion, found {found}")
     intrinsics = _numbers(document.get("intrinsics"), 4)
     model = document.get("camera_model"), document.get("distortion_model")
     if intrinsics is None or model != ("pinhole", "radial-tangential"):
         return None, matrix.reshape(4, 4)
-    return Intrinsics(*intrinsics.tolist()), matrix.reshape(4, 4)
+    camera = Intrinsics(*intrinsics.tolist())
+    if not camera.possible:
+        raise SourceError(f"{path}: expected intrinsics of a camera, found {intrinsics.tolist()}")
+    return camera, matrix.reshape(4, 4)
 
 
 def _numbers(values: object, count: int) -> Array | None:

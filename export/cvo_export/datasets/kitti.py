@@ -77,9 +77,10 @@ def _calibration(path: Path, camera: int) -> tuple[Intrinsics, Array]:
         raise SourceError(f"{path}: expected a line P{camera}:, found {', '.join(rows) or 'none'}")
     P = row.numbers(1).reshape(3, 4)
     K = P[:, :3]
-    if not (np.isfinite(P).all() and K[0, 0] > 0 and K[1, 1] > 0 and (K[2] == [0, 0, 1]).all()):
+    intrinsics = Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    upper = K[1, 0] == 0.0 and (K[2] == [0, 0, 1]).all()
+    if not (np.isfinite(P).all() and intrinsics.possible and upper):
         raise row.refusal()
     T_camera0_camera = np.eye(4)
     T_camera0_camera[:3, 3] = -np.linalg.solve(K, P[:, 3])
-    intrinsics = Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     return intrinsics, T_camera0_camera

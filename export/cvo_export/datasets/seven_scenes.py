@@ -90,7 +90,7 @@ def _own_list(path: Path, names: tuple[str, ...]) -> frozenset[int]:
     """Indices of the sequences a split file lists; those that are not on disk are left out."""
     if not path.is_file():
         return frozenset()
-    numbers = {int(number) for number in re.findall(r"\d+", path.read_text("ascii"))}
+    numbers = {int(number) for number in re.findall(r"\d+", path.read_text("utf-8-sig", "replace"))}
     return frozenset(
         index
         for index, name in enumerate(names)
@@ -108,4 +108,7 @@ def _intrinsics(root: Path, shape: tuple[int, ...]) -> Intrinsics:
         K = np.array(path.read_text("ascii").split(), dtype=np.float64).reshape(3, 3)
     except ValueError:
         raise SourceError(f"{path}: expected nine numbers of a 3x3 matrix") from None
-    return Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    found = Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    if not found.possible:
+        raise SourceError(f"{path}: expected intrinsics of a camera, found {K.tolist()}")
+    return found

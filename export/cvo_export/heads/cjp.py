@@ -92,8 +92,8 @@ class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unkno
     gate: Gate = "corrected"
     interval_form: IntervalForm = "proper"
     kl_weight: Annotated[float, Meta(ge=0)] = 1e-3
-    feature_noise: float = 0.1
-    dropout: float = 0.0
+    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
+    dropout: Annotated[float, Meta(ge=0, lt=1)] = 0.0
     members: Annotated[int, Meta(ge=1, le=64)] = 1
 
 

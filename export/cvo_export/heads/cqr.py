@@ -91,7 +91,7 @@ class CqrConfig(Struct, frozen=True, tag="cqr", tag_field="method", forbid_unkno
     residuals: Residuals = "auto"
     forest_copies: Annotated[int, Meta(ge=0)] = 3
     hidden: tuple[int, int] = (256, 128)
-    feature_noise: float = 0.1
+    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
 
     def __post_init__(self) -> None:
         """Refuse levels that bound nothing."""

@@ -69,8 +69,8 @@ class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unkno
     labels: Literal["ordinal", "one_hot"] = "ordinal"
     label_sigma: Annotated[float, Meta(gt=0)] | None = None
     hidden: tuple[int, int] = (256, 128)
-    feature_noise: float = 0.1
-    dropout: float = 0.0
+    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
+    dropout: Annotated[float, Meta(ge=0, lt=1)] = 0.0
 
 
 class Classes(nn.Module):

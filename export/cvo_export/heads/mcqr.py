@@ -115,7 +115,7 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
     condition_noise: Annotated[float, Meta(ge=0)] = 0.05
     residuals: Residuals = "auto"
     hidden: tuple[int, int] = (256, 128)
-    feature_noise: float = 0.1
+    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
 
     def __post_init__(self) -> None:
         """Refuse passes that are all the same, and their number where there are none."""
