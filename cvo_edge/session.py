@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import onnxruntime
@@ -22,10 +23,53 @@ _DTYPES: dict[str, Dtype] = {"tensor(uint8)": "uint8", "tensor(float)": "float32
 
 
 def allowed_cores() -> int:
-    """Return the number of processor cores this process may use."""
+    """Return the number of processor cores this process may use.
+
+    The smaller of its affinity and of its control group's quota, as containers have it; a part of a
+    core counts as one.
+    """
+    cores = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        cores = len(os.sched_getaffinity(0))
+    return max(1, math.ceil(min(cores, cgroup_cores())))
+
+
+def cgroup_cores(
+    groups: Path = Path("/proc/self/cgroup"), mount: Path = Path("/sys/fs/cgroup")
+) -> float:
+    """Cores' worth of time that this process's control groups allow, infinite without a quota.
+
+    ``groups`` names its groups, ``mount`` is where they are; of version 2, or of version 1 in the
+    folder ``cpu``.
+    """
+    least = math.inf
+    try:
+        lines = groups.read_text("utf-8").splitlines()
+    except OSError:
+        return least
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        root = mount / "cpu" if controllers else mount
+        group = PurePosixPath(path.lstrip("/"))
+        # A group has no more than each one that it is in.
+        for part in (group, *group.parents):
+            least = min(least, _group_cores(root / part))
+    return least
+
+
+def _group_cores(folder: Path) -> float:
+    try:
+        if (folder / "cpu.max").exists():
+            quota, period = (folder / "cpu.max").read_text("ascii").split()
+        else:
+            quota = (folder / "cpu.cfs_quota_us").read_text("ascii")
+            period = (folder / "cpu.cfs_period_us").read_text("ascii")
+        # "max" and -1 are no quota.
+        return int(quota) / int(period) if int(quota) > 0 else math.inf
+    except (OSError, ValueError, ZeroDivisionError):
+        return math.inf
 
 
 class Session:
@@ -77,6 +121,8 @@ class Session:
         # Threads that spin between frames cost four times the processor time at camera rate; this
         # keeps the speed inside one call and gives the cores back after it.
         options.add_session_config_entry("session.force_spinning_stop", "1")
+        # Without it, 8-bit products saturate on x86 processors that have no VNNI, in silence.
+        options.add_session_config_entry("session.x64quantprecision", "1")
         options.log_severity_level = 4
         if keep_in is not None:
             options.optimized_model_filepath = str(keep_in / GRAPH_FILE)

@@ -90,9 +90,17 @@ def _correct_biases(
         # Of a grouped convolution each output sees the inputs of its group.
         group = next((a.i for a in node.attribute if a.name == "group"), 1)
         inputs = means[node.input[0]].reshape(group, -1).repeat(len(weight) // group, axis=0)
-        bias = constants[node.input[2]]
-        shifted = numpy_helper.to_array(bias) + (lost * inputs).sum(axis=1)
-        bias.CopyFrom(numpy_helper.from_array(shifted.astype(np.float32), bias.name))
+        shift = (lost * inputs).sum(axis=1)
+        if len(node.input) == 2:
+            # An exporter leaves out a bias of zeros.
+            node.input.append("")
+        else:
+            bias = constants[node.input[2]]
+            shift += numpy_helper.to_array(bias)
+            model.graph.initializer.remove(bias)
+        corrected = numpy_helper.from_array(shift.astype(np.float32), f"{node.name}/corrected_bias")
+        node.input[2] = corrected.name
+        model.graph.initializer.append(corrected)
 
 
 def _mean_channels(
