@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     )
     from cvo_edge.odometer import Odometer
     from cvo_edge.pose import Chart, ConformalSet, Ellipsoids, Pose, PoseInterval, Reason, Status
+    from cvo_edge.prepared import ModelCache
     from cvo_edge.sources import Frame, open_source
 
 __version__ = "0.1.0"
@@ -41,6 +42,7 @@ __all__ = [
     "Ellipsoids",
     "Frame",
     "GateError",
+    "ModelCache",
     "ModelError",
     "Odometer",
     "Pose",
@@ -65,6 +67,7 @@ _HOMES = {
     "Ellipsoids": "pose",
     "Frame": "sources",
     "GateError": "errors",
+    "ModelCache": "prepared",
     "ModelError": "errors",
     "Odometer": "odometer",
     "Pose": "pose",

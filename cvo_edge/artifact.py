@@ -7,6 +7,7 @@ the format key by key; every refusal here is one line that names the key and the
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import os
@@ -45,6 +46,7 @@ SixOrUnbounded = tuple[
     float | None, float | None, float | None, float | None, float | None, float | None
 ]
 Dtype = Literal["uint8", "float32"]
+Precision = Literal["fp32", "int8"]
 MethodName = Literal["cqr", "csp", "mcqr", "cjp"]
 Quaternion = tuple[float, float, float, float]
 Parameters = TypeVar("Parameters", bound=Struct)
@@ -68,7 +70,7 @@ class ModelSpec(_Strict, frozen=True):
     file: Literal["model.onnx"]
     sha256: Sha256
     opset: Annotated[int, Meta(ge=1)]
-    precision: Literal["fp32", "int8"]
+    precision: Precision
     inputs: tuple[TensorSpec, ...]
     outputs: tuple[TensorSpec, ...]
 
@@ -248,13 +250,27 @@ def read_bundle(folder: Path) -> Bundle:
     calibration = read_calibration(folder)
     path = folder / MODEL_FILE
     model_bytes = _read_regular_file(path, MAX_MODEL_BYTES, ModelError)
-    found = hashlib.sha256(model_bytes).hexdigest()
+    _check_model_digest(path, hashlib.sha256(model_bytes).hexdigest(), calibration)
+    return Bundle(calibration, model_bytes)
+
+
+def check_model_file(folder: Path, calibration: Calibration) -> None:
+    """Raise as ``read_bundle`` where a model file is not the calibrated one, keeping none of it."""
+    path = folder / MODEL_FILE
+    with _regular_file(path, ModelError) as stream:
+        try:
+            found = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as failure:
+            raise ModelError(f"{path}: cannot be read: {failure.strerror}") from None
+    _check_model_digest(path, found, calibration)
+
+
+def _check_model_digest(path: Path, found: str, calibration: Calibration) -> None:
     if found != calibration.model.sha256:
         raise BundleMismatchError(
             f"{path}: expected sha256 {calibration.model.sha256} (from {CALIBRATION_FILE}), "
             f"found {found}"
         )
-    return Bundle(calibration, model_bytes)
 
 
 def read_calibration(folder: Path) -> Calibration:
@@ -292,7 +308,19 @@ def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibra
 
 
 def _read_regular_file(path: Path, limit: int, error: type[CvoError]) -> bytes:
-    """All bytes of a regular file of at most ``limit`` bytes; links and FIFOs are not opened."""
+    """All bytes of a regular file of at most ``limit`` bytes."""
+    with _regular_file(path, error) as stream:
+        try:
+            content = stream.read(limit + 1)
+        except OSError as failure:
+            raise error(f"{path}: cannot be read: {failure.strerror}") from None
+    if len(content) > limit:
+        raise error(f"{path}: expected at most {limit} bytes, found more")
+    return content
+
+
+def _regular_file(path: Path, error: type[CvoError]) -> io.BufferedReader:
+    """Open a regular file; links and FIFOs are not opened."""
     try:
         # O_NONBLOCK: opening a FIFO that nobody writes to must not hang before fstat refuses it.
         flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
@@ -301,16 +329,10 @@ def _read_regular_file(path: Path, limit: int, error: type[CvoError]) -> bytes:
         raise error(f"{path}: expected a file, found none") from None
     except OSError as failure:
         raise error(f"{path}: expected a readable regular file: {failure.strerror}") from None
-    with os.fdopen(descriptor, "rb") as stream:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise error(f"{path}: expected a regular file, found another kind")
-        try:
-            content = stream.read(limit + 1)
-        except OSError as failure:
-            raise error(f"{path}: cannot be read: {failure.strerror}") from None
-    if len(content) > limit:
-        raise error(f"{path}: expected at most {limit} bytes, found more")
-    return content
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise error(f"{path}: expected a regular file, found another kind")
+    return io.BufferedReader(io.FileIO(descriptor))
 
 
 def _parse_json(content: bytes) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from cvo_edge import preprocess
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import Scope
+from cvo_edge.prepared import ModelCache
 from cvo_edge.profile import LatencyProfile, environment, memory_mib, quantiles
 from cvo_edge.session import Session
 from cvo_edge.sources import Frame, open_source
@@ -32,6 +33,7 @@ def benchmark(
     threads: int | None = None,
     confidence: float = 0.9,
     scope: Scope = "marginal",
+    cache: ModelCache | None = None,
 ) -> dict[str, Any]:
     """Time ``frames`` steps, each next to one bare inference call on the same model.
 
@@ -49,7 +51,9 @@ def benchmark(
             f"bench: expected frames >= 1 and warmup >= 0, found {frames} and {warmup}"
         )
     start = perf_counter()
-    odometer = Odometer.load(bundle, threads=threads, confidence=confidence, scope=scope)
+    odometer = Odometer.load(
+        bundle, threads=threads, confidence=confidence, scope=scope, cache=cache
+    )
     load_ms = 1e3 * (perf_counter() - start)
     session = odometer.session
     if session is None:  # pragma: no cover - just loaded

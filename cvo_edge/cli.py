@@ -9,7 +9,10 @@ import sys
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+if TYPE_CHECKING:
+    from cvo_edge.prepared import ModelCache
 
 # numpy's thread pool would double the memory of a process that does no linear algebra in it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -53,6 +56,12 @@ BundleArgument = Annotated[
 ThreadsOption = Annotated[
     int | None, typer.Option(help="Threads of one inference; all allowed cores by default.")
 ]
+CacheOption = Annotated[
+    bool,
+    typer.Option(
+        "--cache/--no-cache", help="Keep the model as it is prepared for this machine, see cache."
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -82,6 +91,7 @@ def run(
         bool,
         typer.Option("--region", help="mcqr, scope joint: the region's points in every record."),
     ] = False,
+    cache: CacheOption = True,
     quiet: Annotated[bool, typer.Option("--quiet", help="No summary on stderr.")] = False,
 ) -> None:
     """Estimate a pose interval for every frame of a source."""
@@ -95,7 +105,11 @@ def run(
     _refuse_overwriting(output, Path(source), ground_truth, bundle)
     truth = open_ground_truth(ground_truth) if ground_truth else None
     with Odometer.load(
-        bundle, threads=threads, confidence=confidence, scope=scope.value
+        bundle,
+        threads=threads,
+        confidence=confidence,
+        scope=scope.value,
+        cache=_model_cache(cache),
     ) as odometer:
         if region and not odometer.has_region:
             raise UsageError(
@@ -132,6 +146,7 @@ def bench(
     frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 200,
     warmup: Annotated[int, typer.Option(min=0, help="Frames before those.")] = 20,
     threads: ThreadsOption = None,
+    cache: CacheOption = True,
     json_file: Annotated[
         str | None, typer.Option("--json", help="Write the report as JSON to a file or -.")
     ] = None,
@@ -145,7 +160,9 @@ def bench(
     """Measure latency, memory and processor time, beside the bare model call."""
     from cvo_edge.benchmark import benchmark, benchmark_lines
 
-    report = benchmark(bundle, source, frames=frames, warmup=warmup, threads=threads)
+    report = benchmark(
+        bundle, source, frames=frames, warmup=warmup, threads=threads, cache=_model_cache(cache)
+    )
     if json_file is not None:
         write_text(json_file, json.dumps(report, indent=1) + "\n")
     if json_file != "-":
@@ -211,6 +228,37 @@ def doctor(as_json: JsonOption = False) -> None:
         print(json.dumps(report, indent=1))
     else:
         print(*doctor_lines(report), sep="\n")
+
+
+@app.command()
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all of them.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """List the models that were prepared for this machine (in $CVO_EDGE_CACHE, or ~/.cache)."""
+    import msgspec
+
+    from cvo_edge.describe import cache_lines
+    from cvo_edge.prepared import ModelCache
+
+    found = ModelCache.default()
+    if clear:
+        removed = found.clear()
+        print(f"{found.folder}: {removed} removed")
+        return
+    if as_json:
+        entries = [msgspec.to_builtins(entry) for entry in found.entries()]
+        print(json.dumps({"folder": str(found.folder), "models": entries}, indent=1))
+    else:
+        print(*cache_lines(found), sep="\n")
+
+
+def _model_cache(wanted: bool) -> ModelCache | None:
+    if not wanted:
+        return None
+    from cvo_edge.prepared import ModelCache
+
+    return ModelCache.default()
 
 
 def _version(wanted: bool) -> None:

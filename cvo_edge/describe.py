@@ -12,6 +12,7 @@ from cvo_edge.heads import HEADS
 from cvo_edge.heads.cqr import CqrParameters
 from cvo_edge.heads.csp import CspParameters
 from cvo_edge.pose import Chart
+from cvo_edge.prepared import ModelCache
 
 
 def inspect_lines(calibration: Calibration) -> list[str]:
@@ -119,6 +120,17 @@ def doctor_lines(report: dict[str, Any]) -> list[str]:
         f"load         {' '.join(f'{value:.2f}' for value in report['load_average'])}",
         f"versions     {versions}",
     ]
+
+
+def cache_lines(cache: ModelCache) -> list[str]:
+    """Return what a cache holds for a person."""
+    entries = cache.entries()
+    lines = [f"folder       {cache.folder}, {len(entries)} prepared model(s)"]
+    for entry in entries:
+        made = f"sha256 {entry.model_sha256[:16]}..., onnxruntime {entry.onnxruntime}"
+        other = "" if entry.current else ", of another machine or release"
+        lines.append(f"{entry.megabytes:9.1f} MB {entry.name} ({made}{other})")
+    return lines
 
 
 def calibration_schema() -> dict[str, Any]:

@@ -17,6 +17,7 @@ from cvo_edge import preprocess
 from cvo_edge.artifact import Bundle, Calibration, Threshold, read_bundle
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, UsageError
 from cvo_edge.heads import HEADS, Head
+from cvo_edge.loading import PreparedBundle, load_bundle
 from cvo_edge.pose import (
     Chart,
     ConformalSet,
@@ -27,6 +28,7 @@ from cvo_edge.pose import (
     Status,
     unbounded_set,
 )
+from cvo_edge.prepared import ModelCache
 from cvo_edge.session import Session
 from cvo_edge.sources import Frame
 
@@ -60,7 +62,7 @@ class Odometer:
     Parameters
     ----------
     bundle
-        A bundle as ``read_bundle`` returns it.
+        A bundle as ``read_bundle`` or ``load_bundle`` returns it.
     threads
         Threads of one inference; all allowed cores by default.
     confidence
@@ -79,7 +81,7 @@ class Odometer:
 
     def __init__(
         self,
-        bundle: Bundle,
+        bundle: Bundle | PreparedBundle,
         *,
         threads: int | None = None,
         confidence: float = 0.9,
@@ -96,7 +98,8 @@ class Odometer:
         self.threshold = self._stored_threshold(confidence, scope)
         self.head = HEADS[calibration.method](calibration)
         _check_tensors(calibration, self.head)
-        self.session: Session | None = Session(bundle.model_bytes, threads, calibration.model)
+        model = bundle.model_bytes if isinstance(bundle, Bundle) else bundle.prepared
+        self.session: Session | None = Session(model, threads, calibration.model)
         reference = calibration.pose.reference_q_xyzw
         self.chart = Chart(
             calibration.pose.rotation,
@@ -118,9 +121,15 @@ class Odometer:
         threads: int | None = None,
         confidence: float = 0.9,
         scope: Scope = "marginal",
+        cache: ModelCache | None = None,
     ) -> Odometer:
-        """Read the bundle folder and be ready to step; parameters and errors as the class's."""
-        content = read_bundle(Path(bundle))
+        """Read the bundle folder and be ready to step; parameters and errors as the class's.
+
+        With a cache, e.g. ``ModelCache.default()``, the model is prepared for this machine once and
+        later loaded in a fraction of time and memory; what it computes is the same.
+        """
+        folder = Path(bundle)
+        content = read_bundle(folder) if cache is None else load_bundle(folder, cache)
         return cls(content, threads=threads, confidence=confidence, scope=scope)
 
     def __enter__(self) -> Odometer:

@@ -1,9 +1,11 @@
-"""The only file that knows onnxruntime: model bytes -> a session that checks what it is."""
+"""The only file that knows onnxruntime: a model -> a session that checks what it is."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import onnxruntime
@@ -11,17 +13,63 @@ from numpy.typing import NDArray
 
 from cvo_edge.artifact import Dtype, ModelSpec, TensorSpec
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
+from cvo_edge.prepared import GRAPH_FILE, WEIGHTS_FILE, Prepared
 
 MAX_THREADS = 64
+# Smaller ones stay in the graph: shapes and scales, of no size.
+_SMALL_TENSOR = 1024
 
 _DTYPES: dict[str, Dtype] = {"tensor(uint8)": "uint8", "tensor(float)": "float32"}
 
 
 def allowed_cores() -> int:
-    """Return the number of processor cores this process may use."""
+    """Return the number of processor cores this process may use.
+
+    The smaller of its affinity and of its control group's quota, as containers have it; a part of a
+    core counts as one.
+    """
+    cores = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        cores = len(os.sched_getaffinity(0))
+    return max(1, math.ceil(min(cores, cgroup_cores())))
+
+
+def cgroup_cores(
+    groups: Path = Path("/proc/self/cgroup"), mount: Path = Path("/sys/fs/cgroup")
+) -> float:
+    """Cores' worth of time that this process's control groups allow, infinite without a quota.
+
+    ``groups`` names its groups, ``mount`` is where they are; of version 2, or of version 1 in the
+    folder ``cpu``.
+    """
+    least = math.inf
+    try:
+        lines = groups.read_text("utf-8").splitlines()
+    except OSError:
+        return least
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        root = mount / "cpu" if controllers else mount
+        group = PurePosixPath(path.lstrip("/"))
+        # A group has no more than each one that it is in.
+        for part in (group, *group.parents):
+            least = min(least, _group_cores(root / part))
+    return least
+
+
+def _group_cores(folder: Path) -> float:
+    try:
+        if (folder / "cpu.max").exists():
+            quota, period = (folder / "cpu.max").read_text("ascii").split()
+        else:
+            quota = (folder / "cpu.cfs_quota_us").read_text("ascii")
+            period = (folder / "cpu.cfs_period_us").read_text("ascii")
+        # "max" and -1 are no quota.
+        return int(quota) / int(period) if int(quota) > 0 else math.inf
+    except (OSError, ValueError, ZeroDivisionError):
+        return math.inf
 
 
 class Session:
@@ -29,13 +77,15 @@ class Session:
 
     Parameters
     ----------
-    model_bytes
+    model
         The model itself, never a path: what was digest-checked is what runs, and a model cannot
-        reach for other files.
+        reach for other files. Or what a cache has of it.
     threads
         Threads of one inference; all allowed cores by default.
     expected
         What the calibration says of inputs and outputs; None to take the model as it is.
+    keep_in
+        Folder to which the prepared model is written, for a cache.
 
     Attributes
     ----------
@@ -53,7 +103,12 @@ class Session:
     """
 
     def __init__(
-        self, model_bytes: bytes, threads: int | None = None, expected: ModelSpec | None = None
+        self,
+        model: bytes | Prepared,
+        threads: int | None = None,
+        expected: ModelSpec | None = None,
+        *,
+        keep_in: Path | None = None,
     ) -> None:
         # The engine would take a thousand, and minutes for a frame.
         if threads is not None and not 1 <= threads <= MAX_THREADS:
@@ -66,10 +121,23 @@ class Session:
         # Threads that spin between frames cost four times the processor time at camera rate; this
         # keeps the speed inside one call and gives the cores back after it.
         options.add_session_config_entry("session.force_spinning_stop", "1")
+        # Without it, 8-bit products saturate on x86 processors that have no VNNI, in silence.
+        options.add_session_config_entry("session.x64quantprecision", "1")
         options.log_severity_level = 4
+        if keep_in is not None:
+            options.optimized_model_filepath = str(keep_in / GRAPH_FILE)
+            prefix = "session.optimized_model_external_initializers_"
+            options.add_session_config_entry(prefix + "file_name", WEIGHTS_FILE)
+            options.add_session_config_entry(prefix + "min_size_in_bytes", str(_SMALL_TENSOR))
+        content = model
+        if isinstance(model, Prepared):
+            content = model.graph
+            options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+            key = "session.model_external_initializers_file_folder_path"
+            options.add_session_config_entry(key, str(model.folder))
         try:
             self.engine = onnxruntime.InferenceSession(
-                model_bytes, options, providers=["CPUExecutionProvider"]
+                content, options, providers=["CPUExecutionProvider"]
             )
         # onnxruntime raises a dozen unrelated types here, UnicodeDecodeError among them.
         except Exception as error:

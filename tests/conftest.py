@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,14 @@ settings.load_profile("project")
 
 ROOT = Path(__file__).resolve().parent.parent
 ARTIFACTS = ROOT / "calibration_artifacts"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_model_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the commands that tests run away from the user's cache of prepared models."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CVO_EDGE_CACHE", str(tmp_path_factory.mktemp("models")))
+        yield
 
 
 @pytest.fixture(scope="session")

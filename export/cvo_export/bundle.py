@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import onnx
 from numpy.typing import NDArray
 
 from cvo_edge import artifact, geometry
@@ -88,16 +89,21 @@ def write_bundle(bundle_dir: Path, calibration: Calibration, model_bytes: bytes)
 
 
 def model_spec(model_bytes: bytes, opset: int) -> artifact.ModelSpec:
-    """What the calibration says of a float32 model."""
+    """What the calibration says of a model; one that quantises anything is an int8 model."""
     session = Session(model_bytes)
     return artifact.ModelSpec(
         file=artifact.MODEL_FILE,
         sha256=hashlib.sha256(model_bytes).hexdigest(),
         opset=opset,
-        precision="fp32",
+        precision=_precision(model_bytes),
         inputs=session.inputs,
         outputs=session.outputs,
     )
+
+
+def _precision(model_bytes: bytes) -> artifact.Precision:
+    kinds = {node.op_type for node in onnx.load_from_string(model_bytes).graph.node}
+    return "int8" if kinds & {"QuantizeLinear", "QLinearConv", "ConvInteger"} else "fp32"
 
 
 def known_coordinates(poses: Array, reference_q_xyzw: Array) -> Array:

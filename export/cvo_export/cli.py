@@ -147,6 +147,13 @@ class ScaleName(StrEnum):
     CONSTANT = "constant"
 
 
+class PrecisionName(StrEnum):
+    """Of the backbone's numbers."""
+
+    FP32 = "fp32"
+    INT8 = "int8"
+
+
 class JointName(StrEnum):
     """How six scores become the joint scope."""
 
@@ -427,6 +434,9 @@ NameOption = Annotated[str | None, typer.Option(help="The folder's name by defau
 def publish(
     run_dir: Annotated[Path, typer.Argument(help="A finished run.", show_default=False)],
     bundle: Annotated[Path, typer.Argument(help="Bundle folder to write.", show_default=False)],
+    precision: Annotated[
+        PrecisionName, typer.Option(help="int8: an 8-bit backbone, calibrated as such.")
+    ] = PrecisionName.FP32,
     rule: RuleOption = None,
     joint: JointOption = JointName.MAX,
     score: ScoreOption = None,
@@ -449,6 +459,7 @@ def publish(
         joint=joint.value,
         score=score,
         sides=sides.value if sides else None,
+        precision=precision.value,
     )
     print(*inspect_lines(calibration), sep="\n")
 

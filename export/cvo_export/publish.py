@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvo_edge import artifact, preprocess
-from cvo_edge.artifact import Calibration
+from cvo_edge.artifact import Calibration, Precision
 from cvo_edge.errors import GateError
 from cvo_edge.heads.cqr import Sides
 from cvo_edge.session import Session
@@ -28,12 +28,15 @@ from cvo_export.bundle import (
     write_bundle,
 )
 from cvo_export.calibrate import Joint, Rule, calibrated, selected
+from cvo_export.quantise import quantised
 from cvo_export.run import Run
 from cvo_export.to_onnx import OPSET, check_parity, export_onnx
 
 Array = NDArray[np.float64]
 
 _PARITY_FRAMES = 32
+# Frames that show how far the numbers of a feature map reach.
+_RANGE_FRAMES = 128
 
 
 def publish(
@@ -45,11 +48,13 @@ def publish(
     joint: Joint = "max",
     score: str | None = None,
     sides: Sides | None = None,
+    precision: Precision = "fp32",
 ) -> Calibration:
     """Export and calibrate a finished run and write its bundle; returns the calibration.
 
     ``rule`` None is ``hierarchical`` for a run split by sequence, else ``pooled``; ``score`` None
-    lets val decide.
+    lets val decide. With ``int8`` the backbone is quantised first: scores and thresholds are those
+    of the very graph in the bundle.
 
     Raises
     ------
@@ -64,37 +69,51 @@ def publish(
     candidates = selected(run.graph.head.candidates(), score, sides)
     if rule is None:
         rule = "hierarchical" if run.split.kind == "sequence" else "pooled"
-    model_bytes, parity = _export(run)
+    model_bytes, parity = _export(run, precision)
     draft = _draft(run, model_bytes, name, rule, joint, parity)
     calibration = calibrated(draft, model_bytes, run.dataset, run.split.roles, candidates)
     return write_bundle(bundle_dir, calibration, model_bytes)
 
 
-def _export(run: Run) -> tuple[bytes, float]:
-    """Model bytes, and the largest difference between torch and onnxruntime on frames of val."""
+def _export(run: Run, precision: Precision) -> tuple[bytes, float]:
+    """Model bytes, and the largest difference between torch and onnxruntime on frames of val.
+
+    That difference is of the float32 graph, which the quantised one is made of.
+    """
     config, head = run.config, run.graph.head
     image = torch.zeros((1, config.height, config.width, 3), dtype=torch.uint8)
     names = ["image", *head.extra_inputs]
     inputs = [image, *head.extra_inputs.values()]
     content = export_onnx(run.graph, inputs, names, head.output_names)
-    generator = np.random.default_rng(0)
-    feeds = []
-    for index in run.split.roles["val"][:_PARITY_FRAMES]:
-        bgr = run.dataset.read_image(int(index))
-        feed: dict[str, NDArray[np.generic]] = {
-            "image": preprocess.model_input(bgr, config.height, config.width, config.crop)
-        }
-        for extra, example in head.extra_inputs.items():
-            feed[extra] = generator.standard_normal(example.shape).astype(np.float32)
-        feeds.append(feed)
+    feeds = _feeds(run, run.split.roles["val"][:_PARITY_FRAMES])
     session = Session(content)
     parity = check_parity(run.graph, session, feeds, names)
+    if precision == "int8":
+        training = np.concatenate([run.split.roles["train"], run.split.roles["fit"]])
+        spread = np.linspace(0, training.size - 1, min(_RANGE_FRAMES, training.size)).astype(int)
+        content = quantised(content, _feeds(run, training[spread]))
+        session = Session(content)
     completed = head.completed(content)
     if completed != content:
         after = Session(completed)
         for feed in feeds:
             _compare(head.completed_outputs(session.run(feed)), after.run(feed))
     return completed, parity
+
+
+def _feeds(run: Run, indices: NDArray[np.int64]) -> list[dict[str, NDArray[np.generic]]]:
+    """Model inputs of these frames; extra inputs are standard normal noise."""
+    config, generator = run.config, np.random.default_rng(0)
+    feeds = []
+    for index in indices.tolist():
+        bgr = run.dataset.read_image(index)
+        feed: dict[str, NDArray[np.generic]] = {
+            "image": preprocess.model_input(bgr, config.height, config.width, config.crop)
+        }
+        for extra, example in run.graph.head.extra_inputs.items():
+            feed[extra] = generator.standard_normal(example.shape).astype(np.float32)
+        feeds.append(feed)
+    return feeds
 
 
 def _compare(

@@ -1,0 +1,87 @@
+"""A bundle folder -> the bundle, with its model as a cache has it prepared for this machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cvo_edge import preprocess
+from cvo_edge.artifact import (
+    Bundle,
+    Calibration,
+    TensorSpec,
+    check_model_file,
+    read_bundle,
+    read_calibration,
+)
+from cvo_edge.errors import BundleMismatchError, ModelError
+from cvo_edge.prepared import ModelCache, Prepared
+from cvo_edge.session import Session
+
+
+@dataclass(frozen=True)
+class PreparedBundle:
+    """A bundle whose model comes from a cache: the calibration, and what was made of its model."""
+
+    calibration: Calibration
+    prepared: Prepared
+
+
+def load_bundle(folder: Path, cache: ModelCache) -> Bundle | PreparedBundle:
+    """Read and check a bundle folder; its model as the cache has it, or puts it there now.
+
+    The bundle as it is where the cache cannot be used. Errors are those of ``read_bundle``: a model
+    file that is not the calibrated one is refused, whatever the cache holds.
+    """
+    calibration = read_calibration(folder)
+    prepared = cache.find(calibration.model.sha256)
+    if prepared is not None:
+        check_model_file(folder, calibration)
+        return PreparedBundle(calibration, prepared)
+    bundle = read_bundle(folder)
+    prepared = _prepared_now(bundle, cache)
+    return bundle if prepared is None else PreparedBundle(bundle.calibration, prepared)
+
+
+def _prepared_now(bundle: Bundle, cache: ModelCache) -> Prepared | None:
+    """Build the entry; None where it cannot be kept, or does not compute the very same."""
+    new = cache.new_folder()
+    if new is None:
+        return None
+    model = bundle.calibration.model
+    try:
+        plain = Session(bundle.model_bytes, 1, model, keep_in=new)
+        expected = plain.run(_feeds(model.inputs))
+    except (ModelError, BundleMismatchError):
+        # The disk may be full. A model that is itself refused says so when it is loaded without.
+        cache.discard(new)
+        return None
+    # Two models in memory at once would be the peak of the whole run.
+    del plain
+    cache.keep(new, bundle.calibration.name, model.sha256)
+    prepared = cache.find(model.sha256)
+    if prepared is not None and not _same(prepared, bundle, expected):
+        cache.forget(model.sha256)
+        return None
+    return prepared
+
+
+def _same(prepared: Prepared, bundle: Bundle, expected: dict[str, np.ndarray]) -> bool:
+    model = bundle.calibration.model
+    try:
+        found = Session(prepared, 1, model).run(_feeds(model.inputs))
+    except (ModelError, BundleMismatchError):
+        return False
+    return all(np.array_equal(found[name], values) for name, values in expected.items())
+
+
+def _feeds(inputs: tuple[TensorSpec, ...]) -> dict[str, np.ndarray]:
+    """Values for every input: rings as the image, ones elsewhere."""
+    return {
+        spec.name: preprocess.selftest_image(*spec.shape[1:3])[np.newaxis]
+        if spec.dtype == "uint8"
+        else np.ones(spec.shape, np.float32)
+        for spec in inputs
+    }

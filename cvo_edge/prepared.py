@@ -1,0 +1,252 @@
+"""Prepared models: what onnxruntime makes of a model on this machine, built once and kept.
+
+Loading a model means parsing it, rewriting its graph for this processor and laying out its weights
+anew. The result is kept as a folder of two files: the rewritten graph, and its weights, which the
+system maps into memory and shares between processes. An entry belongs to one model, one release of
+onnxruntime and one processor, and is used only while every byte of it is what was written.
+
+Nothing here may keep a model from running: what goes wrong with the cache costs its advantage only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+from msgspec import Struct
+
+from cvo_edge.errors import UsageError
+
+GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
+CACHE_VARIABLE = "CVO_EDGE_CACHE"
+
+# Hashed beside each other: one core takes 50 ms for the weights of a ResNet34.
+_CHUNK_BYTES = 8 << 20
+_UNFINISHED = ".unfinished-"
+# A build takes seconds: what is older was interrupted.
+_STALE_SECONDS = 3600.0
+
+
+class Entry(Struct, frozen=True, forbid_unknown_fields=True):
+    """``entry.json``: what was prepared, by what, for what, and the digests of both files."""
+
+    name: str
+    model_sha256: str
+    onnxruntime: str
+    processor: str
+    graph_sha256: str
+    weights_sha256: str
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """An entry whose bytes were checked: the graph itself, and the folder with its weights."""
+
+    folder: Path
+    graph: bytes
+
+
+class Listed(Struct, frozen=True):
+    """One line of ``cvo-edge cache``; ``current`` says whether this machine would use it."""
+
+    name: str
+    model_sha256: str
+    onnxruntime: str
+    megabytes: float
+    current: bool
+
+
+class ModelCache:
+    """A folder of prepared models.
+
+    Parameters
+    ----------
+    folder
+        Made when the first model is kept. One that others may write to is not used.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @classmethod
+    def default(cls) -> ModelCache:
+        """The cache in ``$CVO_EDGE_CACHE``, else in ``cvo-edge`` of the user's own caches.
+
+        Raises UsageError for a relative path in that variable: it would mean another folder
+        everywhere.
+        """
+        named = os.environ.get(CACHE_VARIABLE)
+        if named:
+            if not Path(named).is_absolute():
+                raise UsageError(f"{CACHE_VARIABLE}: expected an absolute path, found {named!r}")
+            return cls(Path(named))
+        caches = os.environ.get("XDG_CACHE_HOME", "")
+        base = Path(caches) if Path(caches).is_absolute() else Path("~/.cache").expanduser()
+        return cls(base / "cvo-edge")
+
+    def find(self, model_sha256: str) -> Prepared | None:
+        """Return the entry of a model if this machine has one and its bytes are unchanged.
+
+        A changed one is removed.
+        """
+        if not self._trusted():
+            return None
+        folder = self._entry_folder(model_sha256)
+        if not folder.is_dir():
+            return None
+        try:
+            entry = msgspec.json.decode((folder / ENTRY_FILE).read_bytes(), type=Entry)
+            graph = (folder / GRAPH_FILE).read_bytes()
+            unchanged = (
+                (entry.model_sha256, entry.onnxruntime, entry.processor)
+                == (model_sha256, _onnxruntime_version(), _processor())
+                and hashlib.sha256(graph).hexdigest() == entry.graph_sha256
+                and file_digest(folder / WEIGHTS_FILE) == entry.weights_sha256
+            )
+        except (OSError, msgspec.DecodeError):
+            unchanged = False
+        if unchanged:
+            return Prepared(folder, graph)
+        self.forget(model_sha256)
+        return None
+
+    def new_folder(self) -> Path | None:
+        """Return a folder to write an entry's files to; None where none can be made."""
+        try:
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if not self._trusted():
+                return None
+            self._sweep()
+            return Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=self.folder))
+        except OSError:
+            return None
+
+    def keep(self, new: Path, name: str, model_sha256: str) -> None:
+        """Make an entry of a new folder's two files, unless another process was faster.
+
+        The folder is gone afterwards, whatever happened.
+        """
+        try:
+            entry = Entry(
+                name=name,
+                model_sha256=model_sha256,
+                onnxruntime=_onnxruntime_version(),
+                processor=_processor(),
+                graph_sha256=hashlib.sha256((new / GRAPH_FILE).read_bytes()).hexdigest(),
+                weights_sha256=file_digest(new / WEIGHTS_FILE),
+            )
+            (new / ENTRY_FILE).write_bytes(msgspec.json.encode(entry))
+            # Whole or not at all; a folder that is there and not empty is left as it is.
+            new.rename(self._entry_folder(model_sha256))
+        except OSError:
+            pass
+        finally:
+            self.discard(new)
+
+    def discard(self, new: Path) -> None:
+        """Remove a new folder."""
+        shutil.rmtree(new, ignore_errors=True)
+
+    def forget(self, model_sha256: str) -> None:
+        """Remove the entry of a model."""
+        shutil.rmtree(self._entry_folder(model_sha256), ignore_errors=True)
+
+    def entries(self) -> list[Listed]:
+        """Return what the cache holds, in order of its names."""
+        found = []
+        for folder in self._folders():
+            try:
+                entry = msgspec.json.decode((folder / ENTRY_FILE).read_bytes(), type=Entry)
+                size = sum(path.stat().st_size for path in folder.iterdir())
+            except (OSError, msgspec.DecodeError):
+                continue
+            found.append(
+                Listed(
+                    entry.name,
+                    entry.model_sha256,
+                    entry.onnxruntime,
+                    size / 1e6,
+                    folder == self._entry_folder(entry.model_sha256),
+                )
+            )
+        return sorted(found, key=lambda listed: (listed.name, listed.model_sha256))
+
+    def clear(self) -> int:
+        """Remove every entry and what interrupted builds left; returns how many entries."""
+        count = 0
+        for folder in self._folders():
+            count += not folder.name.startswith(_UNFINISHED)
+            shutil.rmtree(folder, ignore_errors=True)
+        return count
+
+    def _folders(self) -> list[Path]:
+        """Folders of ours: a cache that someone put elsewhere may lie among other files."""
+        if not self.folder.is_dir():
+            return []
+        return [
+            path
+            for path in sorted(self.folder.iterdir())
+            if path.is_dir() and (path.name.startswith(_UNFINISHED) or (path / ENTRY_FILE).exists())
+        ]
+
+    def _sweep(self) -> None:
+        for path in self.folder.glob(f"{_UNFINISHED}*"):
+            if time.time() - path.stat().st_mtime > _STALE_SECONDS:
+                shutil.rmtree(path, ignore_errors=True)
+
+    def _trusted(self) -> bool:
+        """Whether the folder is this user's, and nobody else's to write to."""
+        try:
+            found = self.folder.stat()
+        except OSError:
+            return False
+        return found.st_uid == os.getuid() and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+    def _entry_folder(self, model_sha256: str) -> Path:
+        key = "\n".join((model_sha256, _onnxruntime_version(), _processor()))
+        return self.folder / hashlib.sha256(key.encode()).hexdigest()[:32]
+
+
+def file_digest(path: Path) -> str:
+    """Digest of a file, of the digests of its chunks, taken beside each other; raises OSError.
+
+    Not the file's sha256; as hard to forge, and as fast as there are cores. Nothing is kept in
+    memory.
+    """
+    size = path.stat().st_size
+
+    def chunk(offset: int) -> bytes:
+        with path.open("rb") as stream:
+            stream.seek(offset)
+            return hashlib.sha256(stream.read(_CHUNK_BYTES)).digest()
+
+    with ThreadPoolExecutor() as pool:
+        digests: Iterable[bytes] = pool.map(chunk, range(0, size, _CHUNK_BYTES))
+        return hashlib.sha256(size.to_bytes(8, "little") + b"".join(digests)).hexdigest()
+
+
+def _onnxruntime_version() -> str:
+    return importlib.metadata.version("onnxruntime")
+
+
+def _processor() -> str:
+    """What decides the layout of weights: architecture, and what the processor can do."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
+    except OSError:
+        lines = [platform.processor()]
+    wanted = ("model name", "flags", "Features", "CPU part")
+    told = sorted({line for line in lines if line.partition("\t")[0].strip() in wanted})
+    text = "\n".join([platform.machine(), *told])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

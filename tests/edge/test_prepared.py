@@ -1,0 +1,188 @@
+"""Prepared models: the same numbers, never a changed byte, and never a reason not to run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cvo_edge.artifact import Bundle, read_bundle
+from cvo_edge.errors import BundleMismatchError, UsageError
+from cvo_edge.loading import PreparedBundle, load_bundle
+from cvo_edge.odometer import Odometer
+from cvo_edge.prepared import ENTRY_FILE, GRAPH_FILE, WEIGHTS_FILE, ModelCache, file_digest
+from cvo_edge.sources import open_source
+
+CVO_EDGE = [sys.executable, "-c", "from cvo_edge.cli import main; main()"]
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> ModelCache:
+    return ModelCache(tmp_path / "cache")
+
+
+def entry_folder(cache: ModelCache) -> Path:
+    (folder,) = cache.folder.iterdir()
+    return folder
+
+
+@pytest.mark.parametrize("method", ["cjp", "cqr", "csp", "mcqr"])
+def test_a_prepared_model_computes_the_very_same(method, bundle_dir, clip_dir, cache):
+    folder = bundle_dir.with_name(f"synthetic-room-{method}")
+    with (
+        Odometer.load(folder) as plain,
+        Odometer.load(folder, cache=cache) as built,
+        Odometer.load(folder, cache=cache) as found,
+    ):
+        for frame in list(open_source(str(clip_dir)))[:3]:
+            expected, *others = (o.observe(frame.image, 0) for o in (plain, built, found))
+            assert expected.fault is None
+            for other in others:
+                for name, values in expected.outputs.items():
+                    assert np.array_equal(values, other.outputs[name])
+    assert isinstance(load_bundle(folder, cache), PreparedBundle)
+
+
+@pytest.mark.parametrize("file", [GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE])
+def test_a_changed_byte_is_never_used(file, bundle_dir, bundle, cache):
+    sha256 = bundle.calibration.model.sha256
+    load_bundle(bundle_dir, cache)
+    path = entry_folder(cache) / file
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    assert cache.find(sha256) is None
+    assert not path.exists()
+    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+    assert cache.find(sha256) is not None
+
+
+@pytest.mark.parametrize("file", [GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE])
+def test_a_missing_file_is_a_missing_entry(file, bundle_dir, bundle, cache):
+    load_bundle(bundle_dir, cache)
+    (entry_folder(cache) / file).unlink()
+    assert cache.find(bundle.calibration.model.sha256) is None
+
+
+@pytest.mark.parametrize("key", ["model_sha256", "onnxruntime", "processor"])
+def test_an_entry_of_something_else_is_not_used(key, bundle_dir, bundle, cache):
+    load_bundle(bundle_dir, cache)
+    path = entry_folder(cache) / ENTRY_FILE
+    entry = json.loads(path.read_bytes())
+    path.write_text(json.dumps({**entry, key: "of another"}))
+    assert cache.find(bundle.calibration.model.sha256) is None
+
+
+def test_a_swapped_model_is_refused_whatever_the_cache_holds(copied_bundle, cache):
+    load_bundle(copied_bundle, cache)
+    path = copied_bundle / "model.onnx"
+    path.write_bytes(path.read_bytes() + b"\0")
+    with pytest.raises(BundleMismatchError, match=hashlib.sha256(path.read_bytes()).hexdigest()):
+        Odometer.load(copied_bundle, cache=cache)
+
+
+def test_a_folder_that_others_may_write_to_is_not_used(bundle_dir, cache):
+    load_bundle(bundle_dir, cache)
+    cache.folder.chmod(0o777)
+    assert isinstance(load_bundle(bundle_dir, cache), Bundle)
+    cache.folder.chmod(0o700)
+    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+
+
+def test_a_cache_that_cannot_be_made_costs_nothing_but_itself(bundle_dir, tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    assert isinstance(load_bundle(bundle_dir, ModelCache(tmp_path / "file")), Bundle)
+    assert isinstance(load_bundle(bundle_dir, ModelCache(tmp_path / "file" / "below")), Bundle)
+
+
+def test_a_full_disk_costs_the_entry_alone(bundle_dir, clip_dir, tmp_path):
+    """Files of at most 64 KiB: onnxruntime cannot write the weights."""
+    program = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536));"
+        "from cvo_edge.cli import main; main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "run", str(bundle_dir), str(clip_dir), "--max-frames=2"],
+        env={**os.environ, "CVO_EDGE_CACHE": str(tmp_path / "cache")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout.count('"status":"ok"')) == (0, 2), done.stderr
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
+def test_processes_that_build_at_once_leave_one_whole_entry(bundle_dir, clip_dir, tmp_path, bundle):
+    folder = tmp_path / "cache"
+    command = [*CVO_EDGE, "run", str(bundle_dir), str(clip_dir)]
+    running = [
+        subprocess.Popen(
+            [*command, "--max-frames=1", "--quiet"],
+            env={**os.environ, "CVO_EDGE_CACHE": str(folder)},
+            stdout=subprocess.PIPE,
+        )
+        for _ in range(4)
+    ]
+    poses = {json.loads(process.communicate()[0])["pose"]["t_m"][0] for process in running}
+    assert [process.returncode for process in running] == [0] * 4
+    assert len(poses) == 1
+    assert len(list(folder.iterdir())) == 1
+    assert ModelCache(folder).find(bundle.calibration.model.sha256) is not None
+
+
+def test_what_an_interrupted_build_left_is_swept_when_it_is_old(bundle_dir, cache):
+    cache.folder.mkdir(mode=0o700)
+    old, young = (cache.new_folder() for _ in range(2))
+    assert old is not None
+    assert young is not None
+    os.utime(old, (0, 0))
+    load_bundle(bundle_dir, cache)
+    assert not old.exists()
+    assert young.exists()
+
+
+def test_clear_removes_what_is_the_caches_own(bundle_dir, cache):
+    load_bundle(bundle_dir, cache)
+    cache.new_folder()
+    (cache.folder / "someone's").mkdir()
+    (cache.folder / "note.txt").write_text("mine")
+    assert [entry.current for entry in cache.entries()] == [True]
+    assert cache.clear() == 1
+    assert sorted(path.name for path in cache.folder.iterdir()) == ["note.txt", "someone's"]
+
+
+def test_the_folder_is_named_by_the_environment(monkeypatch, tmp_path):
+    monkeypatch.setenv("CVO_EDGE_CACHE", str(tmp_path))
+    assert ModelCache.default().folder == tmp_path
+    monkeypatch.setenv("CVO_EDGE_CACHE", "relative")
+    with pytest.raises(UsageError, match="absolute"):
+        ModelCache.default()
+    monkeypatch.delenv("CVO_EDGE_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert ModelCache.default().folder == tmp_path / "cvo-edge"
+
+
+@pytest.mark.parametrize("size", [0, 1, (8 << 20) - 1, 8 << 20, (8 << 20) + 1])
+def test_a_files_digest_depends_on_every_byte_and_the_length(size, tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(bytes(size))
+    digests = {file_digest(path)}
+    path.write_bytes(bytes(size + 1))
+    digests.add(file_digest(path))
+    for place in {0, size // 2, size}:
+        changed = bytearray(size + 1)
+        changed[place] = 1
+        path.write_bytes(changed)
+        digests.add(file_digest(path))
+    assert len(digests) == 2 + len({0, size // 2, size})
+
+
+def test_a_bundle_without_a_cache_is_read_as_before(bundle_dir):
+    with Odometer.load(bundle_dir) as odometer:
+        assert odometer.calibration == read_bundle(bundle_dir).calibration

@@ -1,0 +1,57 @@
+"""How many cores there are: what the affinity and every control group above allow."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import pytest
+
+from cvo_edge.session import allowed_cores, cgroup_cores
+
+
+def cores(folder: Path, groups: str, files: dict[str, str]) -> float:
+    (folder / "groups").write_text(groups)
+    for name, content in files.items():
+        path = folder / "mount" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content)
+    return cgroup_cores(folder / "groups", folder / "mount")
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "expected"),
+    [
+        ("0::/\n", {"cpu.max": "150000 100000\n"}, 1.5),
+        ("0::/\n", {"cpu.max": "max 100000\n"}, math.inf),
+        ("0::/\n", {}, math.inf),
+        ("0::/a/b\n", {"a/b/cpu.max": "max 100000", "a/cpu.max": "50000 100000"}, 0.5),
+        ("0::/a\n", {"a/cpu.max": "300000 100000", "cpu.max": "200000 100000"}, 2.0),
+        (
+            "4:memory:/x\n3:cpu,cpuacct:/a\n",
+            {"cpu/a/cpu.cfs_quota_us": "250000\n", "cpu/a/cpu.cfs_period_us": "100000\n"},
+            2.5,
+        ),
+        (
+            "3:cpu:/a\n",
+            {"cpu/a/cpu.cfs_quota_us": "-1\n", "cpu/a/cpu.cfs_period_us": "100000\n"},
+            math.inf,
+        ),
+        ("0::/\n", {"cpu.max": "nonsense"}, math.inf),
+        ("0::/\n", {"cpu.max": "1 0"}, math.inf),
+    ],
+)
+def test_the_smallest_quota_of_a_group_and_those_above_holds(tmp_path, groups, files, expected):
+    assert cores(tmp_path, groups, files) == expected
+
+
+def test_no_control_groups_are_no_quota(tmp_path):
+    assert cgroup_cores(tmp_path / "none", tmp_path) == math.inf
+
+
+@pytest.mark.parametrize(("quota", "expected"), [(math.inf, 2), (0.3, 1), (1.2, 2), (64.0, 2)])
+def test_cores_are_those_of_affinity_and_quota(monkeypatch, quota, expected):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5})
+    monkeypatch.setattr("cvo_edge.session.cgroup_cores", lambda: quota)
+    assert allowed_cores() == expected

@@ -1,0 +1,112 @@
+"""Eight bits: where they are, what is corrected, and that everything stated is of that graph."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from torch import nn
+
+from cvo_edge.artifact import read_bundle
+from cvo_edge.conformal import conformal_quantile
+from cvo_edge.odometer import Odometer
+from cvo_edge.selftest import check_selftest
+from cvo_edge.session import Session
+from cvo_export.calibrate import observe
+from cvo_export.heads.cqr import CqrConfig
+from cvo_export.publish import publish
+from cvo_export.quantise import quantised
+from cvo_export.to_onnx import export_onnx
+from cvo_export.train import train
+
+from .conftest import ignore_progress, tiny_config
+
+
+class Maps(nn.Module):
+    """Three convolutions, one of them by channel, whose last feature maps are the output."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.first = nn.Conv2d(3, 16, 3, padding=1)
+        self.by_channel = nn.Conv2d(16, 16, 3, padding=1, groups=16)
+        self.last = nn.Conv2d(16, 8, 1)
+        # As behind a folded normalisation: channels of very different size.
+        with torch.no_grad():
+            self.by_channel.weight *= torch.logspace(-1, 1.5, 16)[:, None, None, None]
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """Images (n, height, width, 3) -> means of the maps (n, 8)."""
+        x = image.permute(0, 3, 1, 2).float() / 127.5 - 1.0
+        x = torch.clamp(self.first(x), 0.0, 6.0)
+        x = torch.clamp(self.by_channel(x), 0.0, 6.0)
+        return self.last(x).mean(dim=(2, 3))
+
+
+@pytest.fixture(scope="module")
+def both():
+    """The float32 graph, the quantised one, and feeds that it was made with."""
+    image = torch.zeros((1, 24, 32, 3), dtype=torch.uint8)
+    content = export_onnx(Maps().eval(), [image], ["image"], ["features"])
+    generator = np.random.default_rng(0)
+    feeds = [
+        {"image": generator.integers(0, 256, (1, 24, 32, 3)).astype(np.uint8)} for _ in range(16)
+    ]
+    return content, quantised(content, feeds), feeds
+
+
+def kinds(content):
+    return [node.op_type for node in onnx.load_from_string(content).graph.node]
+
+
+def test_weights_are_eight_bits_but_those_of_the_first_convolution(both):
+    content, small, _ = both
+    model = onnx.load_from_string(small)
+    made = {output: node for node in model.graph.node for output in node.output}
+    constants = {constant.name: constant for constant in model.graph.initializer}
+    first, *others = [node for node in model.graph.node if node.op_type == "Conv"]
+    assert first.input[1] in constants
+    assert len(others) == 2
+    for node in others:
+        dequantised = made[node.input[1]]
+        assert dequantised.op_type == "DequantizeLinear"
+        assert constants[dequantised.input[0]].data_type == onnx.TensorProto.INT8
+        # A scale for every channel.
+        assert list(constants[dequantised.input[1]].dims) == [16 if node is others[0] else 8]
+    assert "QuantizeLinear" not in kinds(content)
+
+
+def test_the_mean_output_stays_where_it_was(both):
+    content, small, feeds = both
+    plain, eight = Session(content, 1), Session(small, 1)
+    differences = np.array(
+        [(eight.run(feed)["features"] - plain.run(feed)["features"])[0] for feed in feeds]
+    )
+    spread = np.array([plain.run(feed)["features"][0] for feed in feeds]).std(axis=0)
+    # A step of the last maps is their range over 255; a shift would be of that size.
+    assert np.abs(differences.mean(axis=0)).max() < 0.5 * spread.mean()
+
+
+def test_nothing_of_the_quantiser_is_left_in_the_file(both):
+    model = onnx.load_from_string(both[1])
+    assert [entry.key for entry in model.metadata_props] == []
+
+
+@pytest.mark.parametrize("head", [None, CqrConfig(trees=10)])
+def test_an_eight_bit_bundle_is_calibrated_as_such(head, tmp_path, tiny_run):
+    run = tiny_run
+    if head is not None:
+        run = train(tmp_path / "run", tiny_config(head=head, steps=100), ignore_progress)
+    publish(run, tmp_path / "fp32", "plain")
+    calibration = publish(run, tmp_path / "int8", "eight bits", precision="int8")
+    plain = read_bundle(tmp_path / "fp32")
+    assert (plain.calibration.model.precision, calibration.model.precision) == ("fp32", "int8")
+    assert "QuantizeLinear" in kinds(read_bundle(tmp_path / "int8").model_bytes)
+    with Odometer.load(tmp_path / "int8") as odometer:
+        assert check_selftest(odometer) < calibration.selftest.tolerance
+        seen = observe(odometer, run.dataset, run.split.roles["cal"])
+        scores = odometer.head.scores(seen.outputs, seen.point, seen.truth)
+        stored = calibration.threshold(0.9, "marginal").q_hat
+        assert list(stored) == [conformal_quantile(scores[:, 0, dof], 0.9) for dof in range(6)]
+    assert stored != plain.calibration.threshold(0.9, "marginal").q_hat
