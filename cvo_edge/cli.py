@@ -41,6 +41,14 @@ class ScopeName(StrEnum):
     JOINT = "joint"
 
 
+class ModeName(StrEnum):
+    """What a stream is to be good at."""
+
+    LIVE = "live"
+    LATENCY = "latency"
+    THROUGHPUT = "throughput"
+
+
 class FormatName(StrEnum):
     """Output formats."""
 
@@ -54,7 +62,7 @@ BundleArgument = Annotated[
     Path, typer.Argument(help="Folder with model.onnx and calibration.json.", show_default=False)
 ]
 ThreadsOption = Annotated[
-    int | None, typer.Option(help="Threads of one inference; all allowed cores by default.")
+    int | None, typer.Option(help="Cores to use; all allowed ones by default.")
 ]
 CacheOption = Annotated[
     bool,
@@ -80,6 +88,15 @@ def run(
     scope: Annotated[
         ScopeName, typer.Option(help="Each degree of freedom, or all six at once.")
     ] = ScopeName.MARGINAL,
+    mode: Annotated[
+        ModeName | None,
+        typer.Option(
+            help="live: the newest frame, with little processor time; latency: one frame after the "
+            "other, each as fast as can be; throughput: most frames a second. By default live for "
+            "a camera, else latency.",
+            show_default=False,
+        ),
+    ] = None,
     threads: ThreadsOption = None,
     max_frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many.")] = None,
     fps: Annotated[float | None, typer.Option(help="Stamp frames at this rate from zero.")] = None,
@@ -104,9 +121,11 @@ def run(
 
     _refuse_overwriting(output, Path(source), ground_truth, bundle)
     truth = open_ground_truth(ground_truth) if ground_truth else None
+    frames = open_source(source, fps)
     with Odometer.load(
         bundle,
         threads=threads,
+        mode=mode or (ModeName.LIVE if frames.live else ModeName.LATENCY),
         confidence=confidence,
         scope=scope.value,
         cache=_model_cache(cache),
@@ -116,7 +135,6 @@ def run(
                 f"region: expected a bundle of mcqr and the scope joint, found "
                 f"{odometer.calibration.method} and {scope.value}"
             )
-        frames = open_source(source, fps)
         summary = RunSummary(odometer.chart.dof, confidence, scope, with_truth=truth is not None)
         with Sink(output, format.value, region=region) as sink:
             try:
@@ -145,6 +163,9 @@ def bench(
     ] = None,
     frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 200,
     warmup: Annotated[int, typer.Option(min=0, help="Frames before those.")] = 20,
+    mode: Annotated[
+        ModeName, typer.Option(help="As for run; live plays 30 frames a second, or SOURCE's own.")
+    ] = ModeName.LATENCY,
     threads: ThreadsOption = None,
     cache: CacheOption = True,
     json_file: Annotated[
@@ -161,7 +182,13 @@ def bench(
     from cvo_edge.benchmark import benchmark, benchmark_lines
 
     report = benchmark(
-        bundle, source, frames=frames, warmup=warmup, threads=threads, cache=_model_cache(cache)
+        bundle,
+        source,
+        frames=frames,
+        warmup=warmup,
+        mode=mode,
+        threads=threads,
+        cache=_model_cache(cache),
     )
     if json_file is not None:
         write_text(json_file, json.dumps(report, indent=1) + "\n")

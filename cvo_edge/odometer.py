@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -11,13 +11,14 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from cvo_edge import preprocess
 from cvo_edge.artifact import Bundle, Calibration, Threshold, read_bundle
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, UsageError
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.loading import PreparedBundle, load_bundle
+from cvo_edge.modes import Mode, checked_mode, in_order, plan
 from cvo_edge.pose import (
     Chart,
     ConformalSet,
@@ -30,7 +31,7 @@ from cvo_edge.pose import (
 )
 from cvo_edge.prepared import ModelCache
 from cvo_edge.session import Session
-from cvo_edge.sources import Frame
+from cvo_edge.sources import Frame, Newest, Source
 
 Array = NDArray[np.float64]
 
@@ -64,7 +65,10 @@ class Odometer:
     bundle
         A bundle as ``read_bundle`` or ``load_bundle`` returns it.
     threads
-        Threads of one inference; all allowed cores by default.
+        Cores to use; all allowed ones by default.
+    mode
+        What a stream is to be good at: ``latency``, ``throughput`` or ``live``, see
+        ``cvo_edge.modes``.
     confidence
         One of the confidences stored in the bundle.
     scope
@@ -84,6 +88,7 @@ class Odometer:
         bundle: Bundle | PreparedBundle,
         *,
         threads: int | None = None,
+        mode: Mode | str = Mode.LATENCY,
         confidence: float = 0.9,
         scope: Scope = "marginal",
     ) -> None:
@@ -99,7 +104,13 @@ class Odometer:
         self.head = HEADS[calibration.method](calibration)
         _check_tensors(calibration, self.head)
         model = bundle.model_bytes if isinstance(bundle, Bundle) else bundle.prepared
-        self.session: Session | None = Session(model, threads, calibration.model)
+        self.mode = checked_mode(mode)
+        settings = plan(self.mode, threads)
+        self._workers = settings.workers
+        self.threads = settings.threads * settings.workers
+        self.session: Session | None = Session(
+            model, settings.threads, calibration.model, spinning=settings.spinning
+        )
         reference = calibration.pose.reference_q_xyzw
         self.chart = Chart(
             calibration.pose.rotation,
@@ -119,6 +130,7 @@ class Odometer:
         bundle: str | Path,
         *,
         threads: int | None = None,
+        mode: Mode | str = Mode.LATENCY,
         confidence: float = 0.9,
         scope: Scope = "marginal",
         cache: ModelCache | None = None,
@@ -130,7 +142,7 @@ class Odometer:
         """
         folder = Path(bundle)
         content = read_bundle(folder) if cache is None else load_bundle(folder, cache)
-        return cls(content, threads=threads, confidence=confidence, scope=scope)
+        return cls(content, threads=threads, mode=mode, confidence=confidence, scope=scope)
 
     def __enter__(self) -> Odometer:
         """Return itself."""
@@ -151,7 +163,7 @@ class Odometer:
 
     def step(
         self,
-        image_bgr: ArrayLike | None,
+        image_bgr: NDArray[Any] | None,
         stamp_ns: int | None = None,
         source: str = "",
         read_ms: float = 0.0,
@@ -177,10 +189,40 @@ class Odometer:
         ModelError
             onnxruntime failed.
         """
-        start = perf_counter()
+        return self._estimate(Frame(image_bgr, stamp_ns, source, read_ms), self._next_seq())
+
+    def stream(self, frames: Iterable[Frame | NDArray[Any]]) -> Generator[PoseInterval, None, None]:
+        """Step through a source, or through frames or bare BGR images, lazily, in its order.
+
+        The mode says how. In ``throughput`` the files of a source are also read and decoded beside
+        each other. In ``live`` only the newest frame is used; the numbers of those that were left
+        out are missing in ``seq``. Raises what the source raises, and in ``live`` UsageError for
+        frames that neither come from a camera nor have stamps.
+        """
+        if self.mode is Mode.THROUGHPUT:
+            reads = frames.reads() if isinstance(frames, Source) else map(_already_read, frames)
+            yield from in_order(map(self._task, reads), self._workers)
+            return
+        if self.mode is Mode.LIVE:
+            live = isinstance(frames, Source) and frames.live
+            frames = Newest(map(_as_frame, frames), live=live)
+        for frame in map(_as_frame, frames):
+            self._seq += frame.skipped
+            yield self._estimate(frame, self._next_seq())
+
+    def _task(self, read: Callable[[], Frame]) -> Callable[[], PoseInterval]:
+        """What a worker does for one frame, which has its number before it is read."""
+        seq = self._next_seq()
+        return lambda: self._estimate(read(), seq)
+
+    def _next_seq(self) -> int:
         seq = self._seq
         self._seq += 1
-        observation = self.observe(image_bgr, seq)
+        return seq
+
+    def _estimate(self, frame: Frame, seq: int) -> PoseInterval:
+        start = perf_counter()
+        observation = self.observe(frame.image, seq)
         concluded = perf_counter()
         fault = observation.fault
         region = unbounded_set() if fault else self.region(observation)
@@ -188,8 +230,8 @@ class Odometer:
         end = perf_counter()
         return PoseInterval(
             seq=seq,
-            stamp_ns=stamp_ns,
-            source=source,
+            stamp_ns=frame.stamp_ns,
+            source=frame.source,
             status=Status.INVALID if fault else Status.OK,
             reasons=reasons,
             pose=None if fault else Pose(observation.pose[:3], observation.pose[3:]),
@@ -198,23 +240,15 @@ class Odometer:
             scope=self.scope,
             chart=self.chart,
             latency_ms={
-                "read": round(read_ms, 4),
+                "read": round(frame.read_ms, 4),
                 "preprocess": round(observation.preprocess_ms, 4),
                 "model": round(observation.model_ms, 4),
                 "conformal": round(1e3 * (end - concluded), 4),
-                "total": round(read_ms + 1e3 * (end - start), 4),
+                "total": round(frame.read_ms + frame.waited_ms + 1e3 * (end - start), 4),
             },
         )
 
-    def stream(self, frames: Iterable[Frame | NDArray[Any]]) -> Iterator[PoseInterval]:
-        """Step through frames of a source, or through bare BGR images, lazily."""
-        for frame in frames:
-            if isinstance(frame, Frame):
-                yield self.step(frame.image, frame.stamp_ns, frame.source, frame.read_ms)
-            else:
-                yield self.step(frame)
-
-    def observe(self, image_bgr: ArrayLike | None, seq: int) -> Observation:
+    def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
         """Run the network on one image; the checks on image and outputs are in ``fault``."""
         if self.session is None:
             raise UsageError("Odometer: expected an open one, found it closed")
@@ -290,6 +324,14 @@ def _check_tensors(calibration: Calibration, head: Head) -> None:
             raise BundleMismatchError(
                 f"model.{kind}: expected {needed} for method {calibration.method}, found {found}"
             )
+
+
+def _as_frame(frame: Frame | NDArray[Any]) -> Frame:
+    return frame if isinstance(frame, Frame) else Frame(frame, None, "", 0.0)
+
+
+def _already_read(frame: Frame | NDArray[Any]) -> Callable[[], Frame]:
+    return lambda: _as_frame(frame)
 
 
 def _faulty(reason: Reason) -> Observation:

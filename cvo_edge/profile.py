@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -73,6 +74,19 @@ def memory_mib() -> dict[str, float]:
         "rss": round(kib["VmRSS"] / 1024, 1),
         "anonymous": round(kib["RssAnon"] / 1024, 1),
     }
+
+
+def waited_for_cores_s() -> float:
+    """Seconds that threads of this process have been ready to run and had no core (0 if unknown).
+
+    Of the threads that there are now; what others on the machine take shows here.
+    """
+    waited_ns = 0
+    for path in Path("/proc/self/task").glob("*/schedstat"):
+        # A thread may have ended in between.
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            waited_ns += int(path.read_text().split()[1])
+    return 1e-9 * waited_ns
 
 
 def environment(threads: int | None = None) -> dict[str, Any]:

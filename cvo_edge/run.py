@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import PoseInterval, Status
 from cvo_edge.profile import LatencyProfile, memory_mib
-from cvo_edge.sources import Frame
+from cvo_edge.sources import Source
 from cvo_edge.trajectory import GroundTruth
 
 Array = NDArray[np.float64]
@@ -24,8 +25,9 @@ class RunSummary:
     """Counts, latencies and, with ground truth, coverage: running sums, flat in memory.
 
     Widths are the means over bounded frames, without the gaps of a set that has some; ``disjoint``
-    counts frames with a gap in some degree of freedom; ``covered`` and ``compared`` count frames
-    whose true pose is known and that have a pose.
+    counts frames with a gap in some degree of freedom; ``skipped`` those that were left out for a
+    newer one; ``covered`` and ``compared`` count frames whose true pose is known and that have a
+    pose.
     """
 
     dof: tuple[str, ...]
@@ -37,6 +39,7 @@ class RunSummary:
     latency: LatencyProfile = field(default_factory=LatencyProfile)
     bounded: int = 0
     disjoint: int = 0
+    skipped: int = 0
     width_sum: Array = field(default_factory=lambda: np.zeros(6))
     compared: int = 0
     covered: Array = field(default_factory=lambda: np.zeros(6))
@@ -44,6 +47,7 @@ class RunSummary:
 
     def add(self, estimate: PoseInterval, truth: Array | None) -> None:
         """Count one estimate; ``truth`` is its true pose (7,) where it is known."""
+        self.skipped = estimate.seq - self.frames
         self.statuses[estimate.status] += 1
         self.reasons.update(estimate.reasons)
         self.latency.add(estimate.latency_ms)
@@ -65,6 +69,8 @@ class RunSummary:
         """Return the summary as lines of text for a person."""
         counts = ", ".join(f"{self.statuses[status]} {status}" for status in Status)
         lines = [f"frames      {self.frames}: {counts}; {self.bounded} with finite bounds"]
+        if self.skipped:
+            lines.append(f"skipped     {self.skipped} frames, for newer ones")
         if self.disjoint:
             lines.append(f"bands       {self.disjoint} frames with a set in more than one piece")
         if self.reasons:
@@ -100,7 +106,7 @@ class RunSummary:
 
 def run(
     odometer: Odometer,
-    frames: Iterable[Frame],
+    frames: Source,
     write: Callable[[PoseInterval], None],
     *,
     summary: RunSummary,
@@ -111,6 +117,7 @@ def run(
 
     The summary is the caller's, so that it can still be shown when a source ends early.
     """
-    for estimate in odometer.stream(islice(frames, max_frames)):
-        write(estimate)
-        summary.add(estimate, truth.pose_of(estimate) if truth else None)
+    with closing(odometer.stream(frames)) as estimates:
+        for estimate in islice(estimates, max_frames):
+            write(estimate)
+            summary.add(estimate, truth.pose_of(estimate) if truth else None)

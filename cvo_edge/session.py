@@ -72,6 +72,14 @@ def _group_cores(folder: Path) -> float:
         return math.inf
 
 
+def checked_threads(threads: int | None) -> int:
+    """Return a number of threads, by default one for each allowed core; raises UsageError."""
+    # The engine would take a thousand, and minutes for a frame.
+    if threads is not None and not 1 <= threads <= MAX_THREADS:
+        raise UsageError(f"threads: expected 1 to {MAX_THREADS}, found {threads}")
+    return threads or allowed_cores()
+
+
 class Session:
     """One loaded model.
 
@@ -84,6 +92,9 @@ class Session:
         Threads of one inference; all allowed cores by default.
     expected
         What the calibration says of inputs and outputs; None to take the model as it is.
+    spinning
+        Whether threads wait for each other at full speed within an inference: faster, for more
+        processor time.
     keep_in
         Folder to which the prepared model is written, for a cache.
 
@@ -108,12 +119,10 @@ class Session:
         threads: int | None = None,
         expected: ModelSpec | None = None,
         *,
+        spinning: bool = True,
         keep_in: Path | None = None,
     ) -> None:
-        # The engine would take a thousand, and minutes for a frame.
-        if threads is not None and not 1 <= threads <= MAX_THREADS:
-            raise UsageError(f"threads: expected 1 to {MAX_THREADS}, found {threads}")
-        self.threads = threads or allowed_cores()
+        self.threads = checked_threads(threads)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads
         options.inter_op_num_threads = 1
@@ -121,6 +130,7 @@ class Session:
         # Threads that spin between frames cost four times the processor time at camera rate; this
         # keeps the speed inside one call and gives the cores back after it.
         options.add_session_config_entry("session.force_spinning_stop", "1")
+        options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
         # Without it, 8-bit products saturate on x86 processors that have no VNNI, in silence.
         options.add_session_config_entry("session.x64quantprecision", "1")
         options.log_severity_level = 4

@@ -6,11 +6,13 @@ import glob
 import os
 import re
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from threading import Condition, Thread
 from time import perf_counter
-from typing import Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -27,20 +29,33 @@ _JPEG_END = b"\xff\xd9"
 class Frame:
     """One image of a source, or its absence.
 
-    ``image`` is (height, width, 3) uint8 BGR, or None where it could not be read whole;
-    ``stamp_ns`` is None where the source has no clock; ``read_ms`` what reading and decoding took.
+    ``image`` is (height, width, 3) uint8 BGR, or None where it could not be read whole; of callers
+    of their own it is whatever ``Odometer.step`` takes;
+    ``stamp_ns`` is None where the source has no clock; ``read_ms`` what reading and decoding took,
+    without waiting for a camera; ``waited_ms`` how long it lay ready since; ``skipped`` how many
+    frames of the source before it were left out.
     """
 
-    image: NDArray[np.uint8] | None
+    image: NDArray[Any] | None
     stamp_ns: int | None
     source: str
     read_ms: float
+    waited_ms: float = 0.0
+    skipped: int = 0
 
 
+@runtime_checkable
 class Source(Protocol):
-    """Something that yields frames once, in order; ``length`` is None where it has no end."""
+    """Something that yields frames once, in order; ``length`` is None where it has no end.
+
+    ``live`` says whether frames come by themselves, as those of a camera do.
+    """
 
     length: int | None
+    live: bool
+
+    def reads(self) -> Iterator[Callable[[], Frame]]:
+        """Yield a call for each frame that reads and decodes it; calls may be in other threads."""
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames."""
@@ -115,6 +130,8 @@ def decode_image(content: bytes) -> NDArray[np.uint8] | None:
 class ImageFiles:
     """Image files in the given order; an unreadable one costs that frame only."""
 
+    live = False
+
     def __init__(self, paths: list[Path], fps: float | None, if_empty: str) -> None:
         if not paths:
             raise SourceError(if_empty)
@@ -122,22 +139,21 @@ class ImageFiles:
         self._fps = fps
         self.length: int | None = len(paths)
 
+    def reads(self) -> Iterator[Callable[[], Frame]]:
+        """Yield one call a file."""
+        for seq, path in enumerate(self._paths):
+            yield partial(_read_file, path, _stamp(seq, self._fps))
+
     def __iter__(self) -> Iterator[Frame]:
         """Yield one frame a file."""
-        for seq, path in enumerate(self._paths):
-            start = perf_counter()
-            try:
-                image = decode_image(path.read_bytes())
-            except OSError:
-                image = None
-            spent = 1e3 * (perf_counter() - start)
-            # A file name may be any bytes; a record is UTF-8.
-            name = os.fsencode(path.name).decode("utf-8", "replace")
-            yield Frame(image, _stamp(seq, self._fps), name, spent)
+        for read in self.reads():
+            yield read()
 
 
 class Video:
     """A video file; stamps come from its frame rate unless ``fps`` is given."""
+
+    live = False
 
     def __init__(self, path: Path, fps: float | None) -> None:
         self._path = path
@@ -146,6 +162,11 @@ class Video:
         self._fps = fps or (own if 0.0 < own < 1e5 else None)
         announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.length: int | None = announced if announced > 0 else None
+
+    def reads(self) -> Iterator[Callable[[], Frame]]:
+        """Yield the frames, read: one comes after the other."""
+        for frame in self:
+            yield partial(_itself, frame)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames; raises SourceError where the file ends before its own count."""
@@ -172,28 +193,120 @@ class Video:
 class Camera:
     """A camera by index or device path; stamps are the machine's clock when a frame arrived."""
 
+    live = True
+
     def __init__(self, device: int | str, fps: float | None) -> None:
         self._device = device
         self._fps = fps
         self._capture = _open_capture(device)
         self.length: int | None = None
 
+    def reads(self) -> Iterator[Callable[[], Frame]]:
+        """Yield the frames, read: one comes after the other."""
+        for frame in self:
+            yield partial(_itself, frame)
+
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until the camera gives none; that raises SourceError."""
         seq = 0
         try:
             while True:
+                found = self._capture.grab()
+                stamp_ns = _stamp(seq, self._fps) if self._fps else time.time_ns()
                 start = perf_counter()
-                found, image = self._capture.read()
+                if found:
+                    found, image = self._capture.retrieve()
                 if not found:
                     raise SourceError(f"camera {self._device}: gave no frame after {seq} frames")
-                stamp_ns = _stamp(seq, self._fps) if self._fps else time.time_ns()
                 spent = 1e3 * (perf_counter() - start)
                 name = f"{self._device}#{seq}"
                 yield Frame(np.asarray(image, np.uint8), stamp_ns, name, spent)
                 seq += 1
         finally:
             self._capture.release()
+
+
+class Newest:
+    """The newest frame of a source, which does not wait for whoever looks at it.
+
+    A thread reads on; frames that were not looked at before the next one came are left out, and
+    counted in ``Frame.skipped``. A source that is not live is played at the pace of its stamps.
+    """
+
+    def __init__(self, source: Iterable[Frame], *, live: bool) -> None:
+        self._source = source
+        self._live = live
+        self._changed = Condition()
+        self._frame: Frame | None = None
+        self._ready_at = 0.0
+        self._skipped = 0
+        self._closed = False
+        self._ended = False
+        self._failure: Exception | None = None
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames until the source ends; raises what it raised, after its last frame.
+
+        Raises UsageError where frames have no stamps to be played by.
+        """
+        # Nothing waits for it at the end: a camera may never give another frame.
+        Thread(target=self._read, name="reader", daemon=True).start()
+        try:
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._frame or self._ended)
+                    frame, skipped, self._skipped = self._frame, self._skipped, 0
+                    self._frame = None
+                if frame is None:
+                    break
+                waited_ms = 1e3 * (perf_counter() - self._ready_at)
+                yield replace(frame, waited_ms=waited_ms, skipped=skipped)
+        finally:
+            self._closed = True
+        if self._failure is not None:
+            raise self._failure
+
+    def _read(self) -> None:
+        try:
+            for frame in self._source if self._live else _played(self._source):
+                with self._changed:
+                    self._skipped += self._frame is not None
+                    self._frame, self._ready_at = frame, perf_counter()
+                    self._changed.notify()
+                if self._closed:
+                    return
+        except Exception as error:  # noqa: BLE001 - raised by whoever iterates
+            self._failure = error
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+
+
+def _played(source: Iterable[Frame]) -> Iterator[Frame]:
+    """Frames at the times of their stamps, the first one at once; late ones without a pause."""
+    begin = None
+    for frame in source:
+        if frame.stamp_ns is None:
+            raise UsageError("live: expected a camera, or frames with stamps (--fps), found none")
+        if begin is None:
+            begin = perf_counter() - 1e-9 * frame.stamp_ns
+        time.sleep(max(0.0, begin + 1e-9 * frame.stamp_ns - perf_counter()))
+        yield frame
+
+
+def _read_file(path: Path, stamp_ns: int | None) -> Frame:
+    start = perf_counter()
+    try:
+        image = decode_image(path.read_bytes())
+    except OSError:
+        image = None
+    spent = 1e3 * (perf_counter() - start)
+    # A file name may be any bytes; a record is UTF-8.
+    return Frame(image, stamp_ns, os.fsencode(path.name).decode("utf-8", "replace"), spent)
+
+
+def _itself(frame: Frame) -> Frame:
+    return frame
 
 
 def _images_in(folder: Path) -> list[Path]:

@@ -2,6 +2,7 @@
 
 import hashlib
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,7 +17,7 @@ def noise(height, width, channels=3, dtype=np.uint8):
 def test_halving_is_the_rounded_mean_of_two_by_two():
     image = noise(64, 96)
     blocks = image.reshape(32, 2, 48, 2, 3).astype(int).sum(axis=(1, 3))
-    np.testing.assert_array_equal(preprocess.resize(image, 32, 48), (blocks + 2) // 4)
+    np.testing.assert_array_equal(preprocess.halved(image, 32, 48), (blocks + 2) // 4)
 
 
 def test_resize_gives_these_very_bytes_on_every_machine():
@@ -26,6 +27,14 @@ def test_resize_gives_these_very_bytes_on_every_machine():
     assert found.shape == (1, 192, 256, 3)
     assert found.flags.c_contiguous
     assert hashlib.sha256(found.tobytes()).hexdigest()[:16] == "f69fc097e2dd4112"
+
+
+@pytest.mark.parametrize("size", [(240, 320), (241, 319), (130, 500), (64, 64)])
+def test_the_linear_step_is_the_exact_one_of_opencv(size):
+    image = noise(*size)
+    found = preprocess.model_input(image, 192, 256, "none")[0, ..., ::-1]
+    expected = cv2.resize(image, (256, 192), interpolation=cv2.INTER_LINEAR_EXACT)
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_a_constant_image_stays_constant():
