@@ -219,9 +219,14 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
     split = same_split(opened, recorded)
     target = Target(*(values.numpy() for values in stored["target"]))
     backbone = Backbone(config.backbone, config.height, config.width)
-    backbone.load_state_dict(stored["backbone"])
     setting = Setting(backbone.size, target, config.seed)
-    head = TRAINABLE[config.method].restore(setting, config.head, stored["head"])
+    try:
+        backbone.load_state_dict(stored["backbone"])
+        head = TRAINABLE[config.method].restore(setting, config.head, stored["head"])
+    except RuntimeError:
+        raise UsageError(
+            f"{run_dir}: expected a network of this release, found other tensors in {NETWORK_FILE}"
+        ) from None
     graph = PoseGraph(backbone, head).eval()
     history = [History(*entry) for entry in stored["history"]]
     return Run(config, opened, split, target, graph, stored["weights_sha256"], history)

@@ -245,9 +245,10 @@ def test_exit_7_for_an_output_that_cannot_be_written(bundle_dir, clip_dir, tmp_p
         assert "No space left" in refused(result, 7)
 
 
-def test_bench_reports_the_documented_keys_and_gates_by_exit_8(bundle_dir, clip_dir, tmp_path):
+@pytest.mark.parametrize("mode", ["latency", "throughput", "live"])
+def test_bench_reports_the_documented_keys(bundle_dir, clip_dir, tmp_path, mode):
     report_file = tmp_path / "bench.json"
-    arguments = ("bench", bundle_dir, clip_dir, "--frames", 10, "--warmup", 2)
+    arguments = ("bench", bundle_dir, clip_dir, "--frames", 10, "--warmup", 2, "--mode", mode)
     result = cvo_edge(*arguments, "--json", report_file)
     assert result.returncode == 0, result.stderr
     report = json.loads(report_file.read_text())
@@ -262,10 +263,17 @@ def test_bench_reports_the_documented_keys_and_gates_by_exit_8(bundle_dir, clip_
         "cpu_ms_per_frame",
         "memory_mib",
         "environment",
-        "frames",
+        "frames_skipped",
+        "waited_for_cores",
     ):
         assert key in report
+    assert (report["mode"], report["frames"], report["frames_valid"]) == (mode, 10, 10)
     assert set(report["memory_mib"]) == {"peak_rss", "rss", "anonymous"}
+    assert f"mode {mode}: 10 frames after 2 warm-up" in result.stdout
+
+
+def test_bench_gates_by_exit_8(bundle_dir, clip_dir):
+    arguments = ("bench", bundle_dir, clip_dir, "--frames", 10, "--warmup", 2)
     for gate in (("--max-p95-ms", 1e-6), ("--max-rss-mib", 1)):
         failed = cvo_edge(*arguments, *gate)
         assert failed.returncode == 8

@@ -1,5 +1,7 @@
 """Training: reproducible, resumable to the bit, and refusing what is another run's."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -75,6 +77,15 @@ def test_a_run_folder_of_other_options_is_refused(tiny_run, run_dir):
 
 def test_a_finished_run_is_read_back(tiny_run, run_dir):
     assert same_weights(tiny_run, load_run(run_dir))
+
+
+def test_a_run_of_another_release_is_refused(tiny_run, run_dir, tmp_path):
+    folder = shutil.copytree(run_dir, tmp_path / "run")
+    stored = torch.load(folder / "network.pt", weights_only=True)
+    stored["head"] = {f"old.{name}": values for name, values in stored["head"].items()}
+    torch.save(stored, folder / "network.pt")
+    with pytest.raises(UsageError, match="expected a network of this release"):
+        load_run(folder)
 
 
 def test_an_unfinished_run_cannot_be_published(tmp_path):

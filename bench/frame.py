@@ -1,0 +1,151 @@
+"""One frame: what a bundle costs beside its network, what uncertainty costs, what 8 bits save.
+
+    python bench/frame.py
+
+For every method, whole MobileNetV2 and ResNet34 at 224x224 and the demonstrations' network, in
+float32 and 8 bits, on frames of 640x480. In turns: the bare call of onnxruntime on an input that is
+ready (``raw``), array to intervals (``step``), JPEG file to JSON record in a file (``record``), and
+the same network without what only intervals need, from array to pose (``pose_alone``).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from networks import (
+    BACKBONES,
+    METHODS,
+    PRECISIONS,
+    WORK,
+    demonstration,
+    frames,
+    images,
+    pose_alone,
+    whole_bundle,
+)
+from rounds import figures, interleaved, ratio, write_report
+
+from cvo_edge import preprocess
+from cvo_edge.artifact import Bundle, read_bundle
+from cvo_edge.odometer import Odometer
+from cvo_edge.session import Session
+from cvo_edge.sinks import Sink
+from cvo_edge.sources import decode_image
+
+THREADS, ROUNDS, WARM_UP = 2, 150, 20
+
+
+class Timed:
+    """The calls on one bundle; ``conformal_ms`` is what follows the network in each ``step``."""
+
+    def __init__(self, bundle: Bundle, sink: Sink) -> None:
+        self.conformal_ms: list[float] = []
+        self._spec = bundle.calibration.preprocess
+        self._odometer = Odometer(bundle, threads=THREADS)
+        self._alone = Session(pose_alone(bundle.model_bytes), THREADS)
+        self._sink = sink
+        self._images, self._files = images(), frames()
+        extra = self._odometer.head.extra_inputs(0)
+        self._ready = [{"image": self._input(image), **extra} for image in self._images]
+
+    def calls(self, prefix: str) -> dict[str, Callable[[int], object]]:
+        """Return the calls by name."""
+        names = ("raw", "step", "record", "pose_alone")
+        return {f"{prefix}.{name}": getattr(self, name) for name in names}
+
+    def raw(self, number: int) -> None:
+        """Run the bare call."""
+        if self._odometer.session:
+            self._odometer.session.engine.run(None, self._ready[number % len(self._ready)])
+
+    def step(self, number: int) -> None:
+        """From an array to intervals."""
+        estimate = self._odometer.step(self._images[number % len(self._images)])
+        if not estimate.bounded:
+            raise SystemExit(f"frame {number}: expected finite intervals, found none")
+        self.conformal_ms.append(estimate.latency_ms["conformal"])
+
+    def record(self, number: int) -> None:
+        """From a JPEG file to a line in a file."""
+        path = self._files[number % len(self._files)]
+        image = decode_image(path.read_bytes())
+        self._sink.write(self._odometer.step(image, source=path.name))
+
+    def pose_alone(self, number: int) -> None:
+        """From an array to the pose, without what only intervals need."""
+        self._alone.run({"image": self._input(self._images[number % len(self._images)])})
+
+    def _input(self, image: object) -> preprocess.Image:
+        bgr = preprocess.to_bgr8(image)
+        if bgr is None:
+            raise SystemExit("expected images, found none")
+        return preprocess.model_input(bgr, self._spec.height, self._spec.width, self._spec.crop)
+
+
+def measured(folders: dict[str, Path], rounds: int) -> dict[str, Any]:
+    """Time one method's bundles by precision, all in turns."""
+    with ExitStack() as stack:
+        sink = stack.enter_context(Sink(str(WORK / "records.jsonl"), "jsonl"))
+        timed = {name: Timed(read_bundle(folder), sink) for name, folder in folders.items()}
+        calls: dict[str, Callable[[int], object]] = {}
+        for name, one in timed.items():
+            calls |= one.calls(name)
+        spent = interleaved(calls, rounds=rounds, warmup=WARM_UP)
+    found: dict[str, Any] = {}
+    for name, one in timed.items():
+        ms = {kind: spent[f"{name}.{kind}"] for kind in ("raw", "step", "record", "pose_alone")}
+        alone = float(np.median(ms["pose_alone"]))
+        overhead = float(np.median(ms["step"] - ms["pose_alone"]))
+        found[name] = {
+            "ms": {kind: figures(values) for kind, values in ms.items()},
+            "step_over_raw": ratio(ms["step"], ms["raw"]),
+            "step_minus_raw_ms": figures(ms["step"] - ms["raw"]),
+            "record_over_raw": ratio(ms["record"], ms["raw"]),
+            "cost_of_uncertainty": round(overhead / alone, 4),
+            "after_network_ms": figures(np.array(one.conformal_ms)),
+        }
+    if "int8" in found:
+        found["fp32_over_int8"] = ratio(spent["fp32.raw"], spent["int8.raw"])
+    return found
+
+
+def line(precision: str, found: dict[str, Any]) -> str:
+    """Return one precision's figures as text."""
+    row = found[precision]
+    return (
+        f"{precision}: raw {row['ms']['raw']['median']:7.3f} ms, step / raw "
+        f"{row['step_over_raw']['median']:.3f} (+{row['step_minus_raw_ms']['median']:.3f} ms), "
+        f"record / raw {row['record_over_raw']['median']:.3f}, uncertainty "
+        f"{row['cost_of_uncertainty']:.3f}, after the network "
+        f"{row['after_network_ms']['median']:.3f} ms"
+    )
+
+
+def main() -> None:
+    """Time all bundles, or those of the methods that are named."""
+    methods = sys.argv[1:] or METHODS
+    results: dict[str, Any] = {}
+    for backbone in (*BACKBONES, "demonstration"):
+        results[backbone] = {}
+        for method in methods:
+            folders = {
+                precision: demonstration(method, precision)
+                if backbone == "demonstration"
+                else whole_bundle(method, backbone, precision)
+                for precision in PRECISIONS
+            }
+            found = measured(folders, ROUNDS)
+            results[backbone][method] = found
+            for precision in PRECISIONS:
+                print(f"{backbone:<16} {method:<5} {line(precision, found)}", flush=True)
+            print(f"{'':<22} fp32 / int8 {found['fp32_over_int8']['median']:.2f}", flush=True)
+    write_report("frame", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""What is measured: bundles of whole networks, and frames, made from the synthetic room.
+
+    python bench/networks.py
+
+The networks have hardly been trained (100 steps of their heads, no pretrained weights): their time
+is that of trained ones, their poses are not. Everything is kept in ``build/bench``, where what is
+there is not made again. The trained ones are those in ``calibration_artifacts``.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from itertools import product
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+from onnx.utils import Extractor
+
+ROOT = Path(__file__).resolve().parent.parent
+WORK = ROOT / "build" / "bench"
+ARTIFACTS = ROOT / "calibration_artifacts"
+METHODS = ("cjp", "cqr", "csp", "mcqr")
+BACKBONES = ("mobilenetv2_100", "resnet34")
+PRECISIONS = ("fp32", "int8")
+ROOM = "synthetic:room,flights=20,frames=20"
+FRAMES = "synthetic:room,flights=1,frames=50,size=640x480,seed=1"
+_WHOLE = "--stages final --grid 1x1 --size 224x224 --crop centre"
+_UNTRAINED = "--weights none --steps 100 --copies 0"
+
+
+def whole_bundle(method: str, backbone: str, precision: str = "fp32") -> Path:
+    """Return a bundle of a whole network at 224x224, made now if it is not there."""
+    name = f"{method}-{backbone}"
+    return published(name, precision, f"{method} {ROOM}", f"--backbone {backbone} {_WHOLE}")
+
+
+def published(name: str, precision: str, what: str, options: str) -> Path:
+    """Return the bundle of a hardly trained run, made now if it is not there."""
+    run, bundle = WORK / "runs" / name, WORK / f"{name}-{precision}"
+    if not bundle.exists():
+        method, data = what.split()
+        features = str(WORK / "features")
+        options = f"{options} {_UNTRAINED}"
+        _cvo_export("train", method, data, str(run), *options.split(), "--cache", features)
+        _cvo_export("publish", str(run), str(bundle), "--precision", precision)
+    return bundle
+
+
+def demonstration(method: str, precision: str = "fp32") -> Path:
+    """Return the demonstration bundle of a method: a trained network that is cut short."""
+    return ARTIFACTS / f"synthetic-room-{method}{'' if precision == 'fp32' else '-int8'}"
+
+
+def frames() -> list[Path]:
+    """Fifty JPEG files of 640x480 of a flight through the room, drawn now if not there."""
+    folder = WORK / "frames"
+    if not folder.exists():
+        from cvo_export.datasets import open_dataset
+
+        partial = WORK / "frames.partial"
+        partial.mkdir(parents=True, exist_ok=True)
+        dataset = open_dataset(FRAMES)
+        for index in range(50):
+            cv2.imwrite(str(partial / f"frame-{index:06}.jpg"), dataset.read_image(index))
+        partial.rename(folder)
+    return sorted(folder.glob("*.jpg"))
+
+
+def images() -> list[np.ndarray]:
+    """Return the same frames decoded, (480, 640, 3) uint8 BGR."""
+    return [cv2.imread(str(path)) for path in frames()]
+
+
+def pose_alone(model_bytes: bytes) -> bytes:
+    """Return the part of a model that gives the pose; what only the other outputs need is gone."""
+    extractor = Extractor(onnx.load_from_string(model_bytes))
+    part: bytes = extractor.extract_model(["image"], ["pose"]).SerializeToString()
+    return part
+
+
+def _cvo_export(*arguments: str) -> None:
+    command = [sys.executable, "-c", "from cvo_export.cli import main; main()", *arguments]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+def main() -> None:
+    """Make all of them."""
+    frames()
+    for method, backbone, precision in product(METHODS, BACKBONES, PRECISIONS):
+        print(whole_bundle(method, backbone, precision).name, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""Measuring side by side: what is compared takes turns, and figures are of one run.
+
+Machines change their speed from second to second. A ratio of two medians of separate runs shows
+that; a median of ratios within a round does not.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.profile import environment
+
+RESULTS = Path(__file__).parent / "results" / "speed"
+Array = NDArray[np.float64]
+
+
+def interleaved(
+    calls: Mapping[str, Callable[[int], object]], *, rounds: int, warmup: int
+) -> dict[str, Array]:
+    """Milliseconds of each call in each round, (rounds,); a call is given the round's number.
+
+    Who begins changes from round to round: whoever comes later finds warmer caches.
+    """
+    names = list(calls)
+    spent = {name: np.empty(warmup + rounds) for name in names}
+    for number in range(warmup + rounds):
+        first = number % len(names)
+        for name in names[first:] + names[:first]:
+            begin = perf_counter()
+            calls[name](number)
+            spent[name][number] = 1e3 * (perf_counter() - begin)
+    return {name: values[warmup:] for name, values in spent.items()}
+
+
+def figures(values: Array) -> dict[str, float]:
+    """Median and 95th percentile, four digits."""
+    return {"median": _four(np.median(values)), "p95": _four(np.percentile(values, 95))}
+
+
+def ratio(numerator: Array, denominator: Array) -> dict[str, float]:
+    """Return median and 95th percentile of what one round's times are to each other."""
+    return figures(numerator / denominator)
+
+
+def write_report(name: str, results: Mapping[str, Any], **settings: object) -> None:
+    """Write ``results/speed/NAME.json``: figures, and all that a reader needs to judge them."""
+    report = {
+        "command": " ".join(["python", f"bench/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
+        "settings": settings,
+        "environment": environment(),
+        "results": results,
+    }
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    target = RESULTS / f"{name}.json"
+    target.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
+    print(f"-> {target}")
+
+
+def _four(value: float) -> float:
+    return float(f"{value:.4g}")

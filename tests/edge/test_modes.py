@@ -1,0 +1,173 @@
+"""How streams use the cores: order, errors in their place, the newest frame."""
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from cvo_edge import Frame, Odometer, SourceError, UsageError, open_source
+from cvo_edge.modes import Mode, in_order, plan
+from cvo_edge.sources import Newest
+
+
+def test_each_mode_uses_as_many_threads_as_it_is_given():
+    for mode in Mode:
+        settings = plan(mode, 2)
+        assert settings.threads * settings.workers == 2
+    assert plan(Mode.THROUGHPUT, 3).threads == 1
+    with pytest.raises(UsageError, match="threads: expected 1 to 64, found 0"):
+        plan(Mode.THROUGHPUT, 0)
+
+
+def test_results_come_in_the_order_of_their_tasks():
+    delays = np.random.default_rng(0).uniform(0.0, 0.004, 60)
+
+    def task(number):
+        time.sleep(delays[number])
+        return number
+
+    tasks = (lambda number=number: task(number) for number in range(60))
+    assert list(in_order(tasks, 3)) == list(range(60))
+
+
+def test_few_tasks_are_under_way_and_none_after_the_last_one_wanted():
+    taken = []
+
+    def tasks():
+        for number in range(1000):
+            taken.append(number)
+            yield lambda number=number: number
+
+    results = in_order(tasks(), 2)
+    assert [next(results) for _ in range(5)] == list(range(5))
+    assert len(taken) <= 5 + 2 + 2
+    results.close()
+    assert len(taken) <= 5 + 2 + 2
+
+
+def test_an_error_comes_in_its_place():
+    def fails():
+        raise ValueError("third")
+
+    def ending():
+        yield from (lambda: 1, lambda: 2)
+        raise SourceError("ended early")
+
+    results = in_order([lambda: 1, lambda: 2, fails, lambda: 4], 2)
+    assert [next(results), next(results)] == [1, 2]
+    with pytest.raises(ValueError, match="third"):
+        next(results)
+    results = in_order(ending(), 2)
+    assert [next(results), next(results)] == [1, 2]
+    with pytest.raises(SourceError, match="ended early"):
+        next(results)
+
+
+def picture_free(number):
+    return Frame(None, number * 1_000_000, str(number), 0.0)
+
+
+class Stepping:
+    """Frames that come when a test says so; ``asked`` counts how many were asked for."""
+
+    def __init__(self, count, failure=None):
+        self.go, self.asked, self._count, self._failure = threading.Semaphore(0), 0, count, failure
+
+    def __iter__(self):
+        for number in range(self._count):
+            self.asked += 1
+            self.go.acquire()
+            yield picture_free(number)
+        self.asked += 1
+        if self._failure:
+            raise self._failure
+
+    def give(self, count):
+        """Let so many frames come, and wait until they have been taken."""
+        expected = self.asked + count
+        self.go.release(count)
+        deadline = time.monotonic() + 30
+        while self.asked < expected and time.monotonic() < deadline:
+            time.sleep(0.001)
+        assert self.asked == expected
+
+
+@pytest.mark.parametrize("failure", [None, SourceError("camera 0: gave no frame after 6 frames")])
+def test_the_newest_frame_is_seen_and_the_others_are_counted(failure):
+    source = Stepping(6, failure)
+    newest = iter(Newest(source, live=True))
+    source.go.release()
+    assert (next(newest).source, source._count) == ("0", 6)
+    while source.asked < 2:
+        time.sleep(0.001)
+    source.give(3)
+    frame = next(newest)
+    assert (frame.source, frame.skipped) == ("3", 2)
+    assert frame.waited_ms > 0.0
+    source.give(2)
+    frame = next(newest)
+    assert (frame.source, frame.skipped) == ("5", 1)
+    with pytest.raises(SourceError if failure else StopIteration):
+        next(newest)
+
+
+def test_files_are_played_no_faster_than_their_stamps():
+    frames = [Frame(None, number * 20_000_000, str(number), 0.0) for number in range(4)]
+    begin = time.monotonic()
+    seen = list(Newest(frames, live=False))
+    assert time.monotonic() - begin >= 0.06
+    assert seen[-1].source == "3"
+    assert sum(frame.skipped + 1 for frame in seen) == 4
+
+
+def test_what_cannot_be_played_is_refused(bundle_dir, clip_dir):
+    odometer = Odometer.load(bundle_dir, mode="live")
+    with pytest.raises(UsageError, match="expected a camera, or frames with stamps"):
+        list(odometer.stream(open_source(str(clip_dir))))
+    with pytest.raises(UsageError, match="mode: expected one of live, latency, throughput"):
+        Odometer.load(bundle_dir, mode="fast")
+
+
+def intervals(estimates):
+    return {
+        estimate.source: (estimate.seq, estimate.lower.tolist(), estimate.upper.tolist())
+        for estimate in estimates
+    }
+
+
+def test_every_mode_gives_the_same_numbers(bundle_dir, clip_dir):
+    found = {}
+    for mode in Mode:
+        with Odometer.load(bundle_dir, mode=mode, threads=2) as odometer:
+            found[mode] = intervals(odometer.stream(open_source(str(clip_dir), fps=100)))
+    assert list(found[Mode.THROUGHPUT].items()) == list(found[Mode.LATENCY].items())
+    assert found[Mode.LIVE].items() <= found[Mode.LATENCY].items()
+    numbers = [seq for seq, _, _ in found[Mode.LIVE].values()]
+    assert all(a < b for a, b in pairwise(numbers))
+    assert numbers[-1] == 49  # the last one is never left out
+
+
+def test_a_mode_on_the_command_line(bundle_dir, clip_dir):
+    command = [sys.executable, "-c", "from cvo_edge.cli import main; main()", "run"]
+    outputs = {}
+    for mode in ("latency", "throughput"):
+        arguments = [bundle_dir, clip_dir, "--mode", mode, "--max-frames", 7, "--format", "table"]
+        result = subprocess.run(
+            [*command, *map(str, arguments)], capture_output=True, text=True, check=True
+        )
+        outputs[mode] = result.stdout
+    assert outputs["latency"] == outputs["throughput"]
+    assert len(outputs["latency"].splitlines()) == 8
+    arguments = [bundle_dir, clip_dir, "--mode", "live", "--fps", 1000]
+    result = subprocess.run(
+        [*command, *map(str, arguments)], capture_output=True, text=True, check=True
+    )
+    records = [json.loads(line) for line in result.stdout.splitlines()]
+    left_out = 50 - len(records)
+    assert records[-1]["seq"] == 49
+    assert (f"skipped     {left_out} frames" in result.stderr) == (left_out > 0)
