@@ -33,6 +33,7 @@ from rounds import figures, interleaved, ratio, write_report
 from cvo_edge import preprocess
 from cvo_edge.artifact import Bundle, read_bundle
 from cvo_edge.odometer import Odometer
+from cvo_edge.pose import Scope
 from cvo_edge.session import Session
 from cvo_edge.sinks import Sink
 from cvo_edge.sources import decode_image
@@ -43,10 +44,10 @@ THREADS, ROUNDS, WARM_UP = 2, 150, 20
 class Timed:
     """The calls on one bundle; ``conformal_ms`` is what follows the network in each ``step``."""
 
-    def __init__(self, bundle: Bundle, sink: Sink) -> None:
+    def __init__(self, bundle: Bundle, sink: Sink, scope: Scope = "marginal") -> None:
         self.conformal_ms: list[float] = []
         self._spec = bundle.calibration.preprocess
-        self._odometer = Odometer(bundle, threads=THREADS)
+        self._odometer = Odometer(bundle, threads=THREADS, scope=scope)
         self._alone = Session(pose_alone(bundle.model_bytes), THREADS)
         self._sink = sink
         self._images, self._files = images(), frames()
@@ -87,11 +88,11 @@ class Timed:
         return preprocess.model_input(bgr, self._spec.height, self._spec.width, self._spec.crop)
 
 
-def measured(folders: dict[str, Path], rounds: int) -> dict[str, Any]:
+def measured(folders: dict[str, Path], rounds: int, scope: Scope = "marginal") -> dict[str, Any]:
     """Time one method's bundles by precision, all in turns."""
     with ExitStack() as stack:
         sink = stack.enter_context(Sink(str(WORK / "records.jsonl"), "jsonl"))
-        timed = {name: Timed(read_bundle(folder), sink) for name, folder in folders.items()}
+        timed = {name: Timed(read_bundle(folder), sink, scope) for name, folder in folders.items()}
         calls: dict[str, Callable[[int], object]] = {}
         for name, one in timed.items():
             calls |= one.calls(name)
@@ -99,14 +100,15 @@ def measured(folders: dict[str, Path], rounds: int) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, one in timed.items():
         ms = {kind: spent[f"{name}.{kind}"] for kind in ("raw", "step", "record", "pose_alone")}
-        alone = float(np.median(ms["pose_alone"]))
-        overhead = float(np.median(ms["step"] - ms["pose_alone"]))
+        alone = ms["pose_alone"]
+        more_ms = ms["step"] - alone
         found[name] = {
             "ms": {kind: figures(values) for kind, values in ms.items()},
             "step_over_raw": ratio(ms["step"], ms["raw"]),
             "step_minus_raw_ms": figures(ms["step"] - ms["raw"]),
             "record_over_raw": ratio(ms["record"], ms["raw"]),
-            "cost_of_uncertainty": round(overhead / alone, 4),
+            "uncertainty_ms": figures(more_ms),
+            "cost_of_uncertainty": round(float(np.median(more_ms) / np.median(alone)), 4),
             "after_network_ms": figures(np.array(one.conformal_ms)),
         }
     if "int8" in found:

@@ -1,0 +1,135 @@
+"""How cost grows: with the input's size, confidences, J of MCQR, trees of CQR, K of CSP.
+
+    python bench/scaling.py
+
+Hardly trained networks of the default kind (MobileNetV2 cut at stride 16, 256x192), one setting
+changed at a time; ``uncertainty`` is array to intervals over the same network's array to pose.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import msgspec
+import numpy as np
+from frame import measured
+from networks import ROOM, WORK, demonstration, images
+from rounds import figures, write_report
+
+from cvo_edge.artifact import encode_calibration, read_bundle, read_calibration
+from cvo_edge.odometer import Odometer
+from cvo_edge.pose import Scope
+from cvo_export.configure import configure
+from cvo_export.publish import publish
+from cvo_export.train import train
+
+ROUNDS = 100
+SIZES = ("128x96", "256x192", "384x288", "512x384")
+CONFIDENCES = (1, 10, 50)
+# Method -> its option, values, and what the option decides.
+OPTIONS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "mcqr": ("rays", (5, 21, 85, 192)),
+    "cqr": ("trees", (10, 50, 100, 400)),
+    "csp": ("classes", (16, 64, 128, 256)),
+}
+
+
+def bundle(method: str, size: str = "256x192", **head: int) -> Path:
+    """Return a bundle with these options, made now if it is not there."""
+    name = "-".join([method, size, *(f"{key}{value}" for key, value in head.items())])
+    folder = WORK / "scaling" / name
+    if not folder.exists():
+        config = configure(
+            method=method,
+            dataset=ROOM,
+            split=None,
+            seed=0,
+            size=size,
+            crop="none",
+            backbone="mobilenetv2_100",
+            weights="none",
+            stages="16",
+            grid="3x4",
+            normalisation=None,
+            head=head,
+            steps=100,
+            copies=0,
+        )
+        features = WORK / "features"
+        run = train(WORK / "runs" / name, config, lambda *_: None, features)
+        publish(run, folder, name)
+    return folder
+
+
+def one(folder: Path, scope: Scope = "marginal") -> dict[str, Any]:
+    """Time one bundle as ``bench/frame.py`` does."""
+    found: dict[str, Any] = measured({"fp32": folder}, ROUNDS, scope)["fp32"]
+    outputs = {spec.name: list(spec.shape) for spec in read_calibration(folder).model.outputs}
+    return {"outputs": outputs, **found}
+
+
+def confidences(count: int) -> dict[str, Any]:
+    """Time loading and sets where the bundle stores so many confidences, and all are asked for."""
+    source = demonstration("cjp")
+    content = read_bundle(source)
+    stored = [t for t in content.calibration.thresholds if t.scope == "marginal"]
+    levels = np.linspace(0.5, 0.95, count) if count > 1 else np.array([0.9])
+    thresholds = tuple(
+        msgspec.structs.replace(stored[0], confidence=round(float(level), 4)) for level in levels
+    )
+    calibration = msgspec.structs.replace(content.calibration, thresholds=thresholds)
+    folder = WORK / "scaling" / f"confidences-{count}"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "calibration.json").write_bytes(encode_calibration(calibration))
+    read_ms, sets_ms = [], []
+    odometer = Odometer(content)
+    observation = odometer.observe(images()[0], 0)
+    for _ in range(ROUNDS):
+        begin = perf_counter()
+        found = read_calibration(folder)
+        read = perf_counter()
+        for threshold in found.thresholds:
+            odometer.region(observation, threshold)
+        read_ms.append(1e3 * (read - begin))
+        sets_ms.append(1e3 * (perf_counter() - read))
+    return {
+        "read_calibration_ms": figures(np.array(read_ms)),
+        "sets_ms": figures(np.array(sets_ms)),
+    }
+
+
+def main() -> None:
+    """Measure all of them."""
+    results: dict[str, Any] = {"size": {}, "confidences": {}}
+    for size in SIZES:
+        results["size"][size] = one(bundle("cjp", size))
+        show("size", size, results["size"][size])
+    for count in CONFIDENCES:
+        row = results["confidences"][str(count)] = confidences(count)
+        print(f"confidences {count:>4}: {row}", flush=True)
+    for method, (option, values) in OPTIONS.items():
+        results[option] = {}
+        for value in values:
+            folder = bundle(method, **{option: value})
+            row = results[option][str(value)] = one(folder)
+            show(option, str(value), row)
+            if method == "mcqr":
+                row["joint"] = one(folder, "joint")
+                show(option, f"{value}, joint", row["joint"])
+    write_report("scaling", results, rounds=ROUNDS)
+
+
+def show(what: str, value: str, row: dict[str, Any]) -> None:
+    """Print one line."""
+    print(
+        f"{what:<8} {value:>10}: raw {row['ms']['raw']['median']:.3f} ms, uncertainty "
+        f"{row['uncertainty_ms']['median']:+.3f} ms ({row['cost_of_uncertainty']:.3f}), of it "
+        f"after the network {row['after_network_ms']['median']:.3f} ms",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""A million frames, whether memory grows.
+
+    python bench/soak.py [FRAMES]
+
+The demonstration's frames again and again through all that ``cvo-edge run`` consists of: odometer,
+records, summary, with ground truth. Memory is read a hundred times; growth is what the last tenth
+has more than the second, as the first fills buffers of a bounded size.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from networks import ARTIFACTS, demonstration
+from rounds import write_report
+
+from cvo_edge.modes import Mode
+from cvo_edge.odometer import Odometer
+from cvo_edge.pose import PoseInterval
+from cvo_edge.profile import memory_mib
+from cvo_edge.run import RunSummary, run
+from cvo_edge.sinks import Sink
+from cvo_edge.sources import Frame, open_source
+from cvo_edge.trajectory import open_ground_truth
+
+METHOD, FRAMES, READINGS = "cjp", 1_000_000, 100
+CLIP = ARTIFACTS / "synthetic-room-clip"
+
+
+class Cycled:
+    """Decoded frames of the clip again and again, as a source."""
+
+    live = False
+
+    def __init__(self, length: int) -> None:
+        self.length = length
+        self._frames = list(open_source(str(CLIP)))
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames."""
+        for _, frame in zip(range(self.length), cycle(self._frames), strict=False):
+            yield frame
+
+    def reads(self) -> Iterator[Any]:
+        """Yield calls that give them."""
+        for frame in self:
+            yield lambda frame=frame: frame
+
+
+def main() -> None:
+    """Run, read memory on the way, report."""
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else FRAMES
+    readings: list[dict[str, float]] = []
+    with (
+        Odometer.load(demonstration(METHOD, "int8"), mode=Mode.THROUGHPUT) as odometer,
+        Sink(os.devnull, "jsonl") as sink,
+    ):
+        summary = RunSummary(odometer.chart.dof, 0.9, "marginal", with_truth=True)
+
+        def write(estimate: PoseInterval) -> None:
+            sink.write(estimate)
+            if (estimate.seq + 1) % (count // READINGS) == 0:
+                open_files = len(list(Path("/proc/self/fd").iterdir()))
+                threads = threading.active_count()
+                readings.append({**memory_mib(), "descriptors": open_files, "threads": threads})
+                print(f"{estimate.seq + 1:>9} frames: {readings[-1]}", flush=True)
+
+        truth = open_ground_truth(CLIP)
+        run(odometer, Cycled(count), write, summary=summary, truth=truth)
+    tenth = len(readings) // 10
+
+    def growth(key: str) -> float:
+        values = [row[key] for row in readings]
+        return round(float(np.mean(values[-tenth:]) - np.mean(values[tenth : 2 * tenth])), 3)
+
+    results = {
+        "frames": summary.frames,
+        "growth_mib": {key: growth(key) for key in ("rss", "anonymous")},
+        "growth": {key: growth(key) for key in ("descriptors", "threads")},
+        "first": readings[0],
+        "last": readings[-1],
+    }
+    print(results)
+    write_report("soak", results, method=METHOD, precision="int8", mode=Mode.THROUGHPUT)
+
+
+if __name__ == "__main__":
+    main()

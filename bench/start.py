@@ -1,0 +1,137 @@
+"""Starting: time to load, memory, and a fresh process until its first interval.
+
+    python bench/start.py
+
+Every figure is of fresh processes, in turns: onnxruntime as it comes on the float32 model, and
+``Odometer.load`` with a warm cache of prepared models, in both precisions. Then whole processes:
+the smallest script of onnxruntime and OpenCV that gives a pose of one JPEG file, and ``cvo-edge
+run`` on the same file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+from networks import BACKBONES, WORK, frames, whole_bundle
+from rounds import Array, figures, interleaved, ratio, write_report
+
+METHOD, THREADS, ROUNDS, WARM_UP = "cjp", 2, 15, 2
+
+# Both import what they need before the clock runs, and infer once before memory is read.
+PLAIN = """
+import json, sys
+from time import perf_counter
+import cv2, numpy, onnxruntime
+options = onnxruntime.SessionOptions()
+options.intra_op_num_threads = 2
+begin = perf_counter()
+session = onnxruntime.InferenceSession(sys.argv[1] + "/model.onnx", options)
+load_ms = 1e3 * (perf_counter() - begin)
+session.run(None, {"image": numpy.zeros((1, 224, 224, 3), numpy.uint8)})
+anonymous = next(l for l in open("/proc/self/status") if l.startswith("RssAnon"))
+print(json.dumps({"load_ms": load_ms, "anonymous_mib": int(anonymous.split()[1]) / 1024}))
+"""
+OURS = """
+import os
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+import json, sys
+from time import perf_counter
+import cv2, numpy, onnxruntime
+from cvo_edge import ModelCache, Odometer
+begin = perf_counter()
+odometer = Odometer.load(sys.argv[1], threads=2, cache=ModelCache.default())
+load_ms = 1e3 * (perf_counter() - begin)
+odometer.step(numpy.zeros((480, 640, 3), numpy.uint8))
+anonymous = next(l for l in open("/proc/self/status") if l.startswith("RssAnon"))
+print(json.dumps({"load_ms": load_ms, "anonymous_mib": int(anonymous.split()[1]) / 1024}))
+"""
+SCRIPT = """
+import sys
+import cv2, numpy, onnxruntime
+session = onnxruntime.InferenceSession(sys.argv[1] + "/model.onnx")
+image = cv2.cvtColor(cv2.resize(cv2.imread(sys.argv[2]), (224, 224)), cv2.COLOR_BGR2RGB)
+print(session.run(None, {"image": image[numpy.newaxis]}))
+"""
+RUN = "from cvo_edge.cli import main; main()"
+
+
+def loaded(backbone: str) -> dict[str, Any]:
+    """Load times and anonymous memory of each, and their ratios to onnxruntime as it comes."""
+    plain, int8 = (str(whole_bundle(METHOD, backbone, p)) for p in ("fp32", "int8"))
+    commands = {
+        "onnxruntime": [PLAIN, plain],
+        "cvo-edge fp32": [OURS, plain],
+        "cvo-edge int8": [OURS, int8],
+    }
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in commands}
+    for _ in range(WARM_UP + ROUNDS):
+        for name, command in commands.items():
+            found[name].append(json.loads(_run(command)))
+
+    def values(name: str, key: str) -> Array:
+        return np.array([row[key] for row in found[name][WARM_UP:]])
+
+    return {
+        name: {
+            key: {
+                **figures(values(name, key)),
+                "over_onnxruntime": ratio(values(name, key), values("onnxruntime", key))["median"],
+            }
+            for key in ("load_ms", "anonymous_mib")
+        }
+        for name in commands
+    }
+
+
+def first_interval(backbone: str) -> dict[str, Any]:
+    """Milliseconds of whole processes that end with the result of one file."""
+    bundle, image = str(whole_bundle(METHOD, backbone)), str(frames()[0])
+    calls = {
+        "script": lambda _: _run([SCRIPT, bundle, image]),
+        "cvo-edge": lambda _: _run([RUN, "run", bundle, image, "--quiet"]),
+    }
+    spent = interleaved(calls, rounds=ROUNDS, warmup=WARM_UP)
+    return {
+        "script_ms": figures(spent["script"]),
+        "cvo_edge_ms": figures(spent["cvo-edge"]),
+        "over_script": ratio(spent["cvo-edge"], spent["script"]),
+    }
+
+
+def _run(arguments: list[str]) -> str:
+    environment = {**os.environ, "CVO_EDGE_CACHE": str(WORK / "cache")}
+    command = [sys.executable, "-c", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    return done.stdout
+
+
+def main() -> None:
+    """Measure both backbones."""
+    results: dict[str, Any] = {}
+    for backbone in BACKBONES:
+        results[backbone] = {"load": loaded(backbone), "process": first_interval(backbone)}
+        for name, row in results[backbone]["load"].items():
+            load, memory = row["load_ms"], row["anonymous_mib"]
+            print(
+                f"{backbone:<16} {name:<14} load {load['median']:7.1f} ms "
+                f"({load['over_onnxruntime']:.3f}), anonymous {memory['median']:6.1f} MiB "
+                f"({memory['over_onnxruntime']:.3f})",
+                flush=True,
+            )
+        process = results[backbone]["process"]
+        print(
+            f"{backbone:<16} first result: script {process['script_ms']['median']:.0f} ms, "
+            f"cvo-edge {process['cvo_edge_ms']['median']:.0f} ms "
+            f"({process['over_script']['median']:.3f})",
+            flush=True,
+        )
+    write_report("start", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP, method=METHOD)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,167 @@
+"""A stream of frames: how many a second, and what a steady camera costs.
+
+    python bench/stream.py
+
+Throughput: JPEG files to JSON records, by a script that does one thing after the other with
+onnxruntime as it comes (``naive``), and by ``Odometer.stream`` in each mode and precision, in
+turns. Camera: frames that come 30 times a second, processor time a frame of onnxruntime as it comes
+(the model alone, on an input that is ready) and of mode ``live``.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import cv2
+import numpy as np
+import onnxruntime
+from networks import BACKBONES, WORK, frames, images, whole_bundle
+from rounds import figures, interleaved, ratio, write_report
+
+from cvo_edge.artifact import read_bundle
+from cvo_edge.modes import Mode
+from cvo_edge.odometer import Odometer
+from cvo_edge.sinks import Sink
+from cvo_edge.sources import Frame, open_source
+
+METHOD, THREADS = "cjp", 2
+ROUNDS, WARM_UP = 15, 2
+FPS, SECONDS, CAMERA_ROUNDS = 30, 3, 5
+
+
+def as_it_comes(bundle: Path, threads: int) -> onnxruntime.InferenceSession:
+    """Return a session of onnxruntime with nothing set but the number of threads."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    return onnxruntime.InferenceSession(
+        (bundle / "model.onnx").read_bytes(), options, providers=["CPUExecutionProvider"]
+    )
+
+
+def naive(engine: onnxruntime.InferenceSession, target: Path) -> Callable[[int], object]:
+    """Return a script's loop: read, resize, infer, write, one thing after the other."""
+
+    def run(_: int) -> None:
+        with target.open("w") as stream:
+            for path in frames():
+                image = cv2.cvtColor(cv2.resize(cv2.imread(str(path)), (224, 224)), 4)
+                outputs = engine.run(None, {"image": image[np.newaxis]})
+                stream.write(json.dumps([values.tolist() for values in outputs]) + "\n")
+
+    return run
+
+
+def streamed(odometer: Odometer, sink: Sink) -> Callable[[int], object]:
+    """Return what ``cvo-edge run`` does with the files."""
+
+    def run(_: int) -> None:
+        for estimate in odometer.stream(open_source(str(WORK / "frames"))):
+            sink.write(estimate)
+
+    return run
+
+
+def throughput(backbone: str) -> dict[str, Any]:
+    """Time the whole folder by each, in turns; ratios are of the naive script over ours."""
+    with ExitStack() as stack:
+        sink = stack.enter_context(Sink(str(WORK / "records.jsonl"), "jsonl"))
+        plain = whole_bundle(METHOD, backbone)
+        calls = {"naive": naive(as_it_comes(plain, THREADS), WORK / "naive.jsonl")}
+        for precision in ("fp32", "int8"):
+            for mode in (Mode.LATENCY, Mode.THROUGHPUT):
+                bundle = read_bundle(whole_bundle(METHOD, backbone, precision))
+                odometer = stack.enter_context(Odometer(bundle, threads=THREADS, mode=mode))
+                calls[f"{mode} {precision}"] = streamed(odometer, sink)
+        spent = interleaved(calls, rounds=ROUNDS, warmup=WARM_UP)
+    count = len(frames())
+    return {
+        name: {
+            "ms_per_frame": figures(values / count),
+            "frames_per_second": round(1e3 * count / float(np.median(values)), 1),
+            "naive_over_this": ratio(spent["naive"], values),
+        }
+        for name, values in spent.items()
+    }
+
+
+def camera(backbone: str) -> dict[str, Any]:
+    """Processor time of a frame at 30 a second, in turns of some seconds; ages in ms."""
+    count = FPS * SECONDS
+    pictures = [Frame(image, round(1e9 * n / FPS), "", 0.0) for n, image in enumerate(images())]
+    played = [
+        Frame(pictures[n % len(pictures)].image, round(1e9 * n / FPS), "", 0.0)
+        for n in range(count)
+    ]
+    feeds = {"image": np.zeros((1, 224, 224, 3), np.uint8)}
+
+    def paced(engine: onnxruntime.InferenceSession) -> Callable[[], list[float]]:
+        def run() -> list[float]:
+            begin = perf_counter()
+            for number in range(count):
+                time.sleep(max(0.0, begin + number / FPS - perf_counter()))
+                engine.run(None, feeds)
+            return []
+
+        return run
+
+    def live(odometer: Odometer) -> Callable[[], list[float]]:
+        return lambda: [e.latency_ms["total"] for e in odometer.stream(played)]
+
+    with ExitStack() as stack:
+        calls: dict[str, Callable[[], list[float]]] = {}
+        calls["onnxruntime"] = paced(as_it_comes(whole_bundle(METHOD, backbone), THREADS))
+        for precision, threads in (("fp32", THREADS), ("int8", THREADS), ("int8", 1)):
+            bundle = read_bundle(whole_bundle(METHOD, backbone, precision))
+            odometer = Odometer(bundle, threads=threads, mode=Mode.LIVE)
+            calls[f"live {precision}, {threads}"] = live(stack.enter_context(odometer))
+        cpu_ms: dict[str, list[float]] = {name: [] for name in calls}
+        ages_ms: dict[str, list[float]] = {name: [] for name in calls}
+        for _ in range(CAMERA_ROUNDS):
+            for name, call in calls.items():
+                # What spins after the one before has come to rest.
+                time.sleep(1.0)
+                begin = process_time()
+                found = call()
+                cpu_ms[name].append(1e3 * (process_time() - begin) / count)
+                ages_ms[name] += found
+    others = np.array(cpu_ms["onnxruntime"])
+    return {
+        name: {
+            "cpu_ms_per_frame": figures(np.array(cpu_ms[name])),
+            "over_onnxruntime": ratio(np.array(cpu_ms[name]), others),
+            "age_ms": figures(np.array(ages_ms[name])) if ages_ms[name] else None,
+        }
+        for name in calls
+    }
+
+
+def main() -> None:
+    """Measure both for both backbones."""
+    results: dict[str, Any] = {}
+    for backbone in BACKBONES:
+        results[backbone] = {"throughput": throughput(backbone), "camera": camera(backbone)}
+        for name, row in results[backbone]["throughput"].items():
+            print(
+                f"{backbone:<16} {name:<17} {row['ms_per_frame']['median']:7.2f} ms a frame, "
+                f"{row['naive_over_this']['median']:.2f} times the naive script",
+                flush=True,
+            )
+        for name, row in results[backbone]["camera"].items():
+            print(
+                f"{backbone:<16} {name:<17} {row['cpu_ms_per_frame']['median']:7.2f} CPU-ms a "
+                f"frame at {FPS}, {row['over_onnxruntime']['median']:.3f} of onnxruntime's",
+                flush=True,
+            )
+    write_report(
+        "stream", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP, fps=FPS, method=METHOD
+    )
+
+
+if __name__ == "__main__":
+    main()
