@@ -9,6 +9,7 @@ import numpy as np
 
 from cvo_edge import preprocess
 from cvo_edge.artifact import (
+    MODEL_FILE,
     Bundle,
     Calibration,
     TensorSpec,
@@ -17,7 +18,7 @@ from cvo_edge.artifact import (
     read_calibration,
 )
 from cvo_edge.errors import BundleMismatchError, ModelError
-from cvo_edge.prepared import ModelCache, Prepared
+from cvo_edge.prepared import ModelCache, Prepared, identity
 from cvo_edge.session import Session
 
 
@@ -33,12 +34,18 @@ def load_bundle(folder: Path, cache: ModelCache) -> Bundle | PreparedBundle:
     """Read and check a bundle folder; its model as the cache has it, or puts it there now.
 
     The bundle as it is where the cache cannot be used. Errors are those of ``read_bundle``: a model
-    file that is not the calibrated one is refused, whatever the cache holds.
+    file that is not the calibrated one is refused, whatever the cache holds. The digest of one that
+    has not changed since it was last taken, as the system has it, is not taken again.
     """
     calibration = read_calibration(folder)
     prepared = cache.find(calibration.model.sha256)
     if prepared is not None:
-        check_model_file(folder, calibration)
+        model = folder / MODEL_FILE
+        # What runs is the entry, whose digests were checked: this is for whoever swaps the file.
+        if not cache.knows(prepared, model):
+            before = identity(model)
+            check_model_file(folder, calibration)
+            cache.remember(prepared, model, before)
         return PreparedBundle(calibration, prepared)
     bundle = read_bundle(folder)
     prepared = _prepared_now(bundle, cache)

@@ -10,6 +10,7 @@ Nothing here may keep a model from running: what goes wrong with the cache costs
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import os
@@ -29,6 +30,7 @@ from msgspec import Struct
 from cvo_edge.errors import UsageError
 
 GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
+SEEN_FILE = "seen.json"
 CACHE_VARIABLE = "CVO_EDGE_CACHE"
 
 # Hashed beside each other: one core takes 50 ms for the weights of a ResNet34.
@@ -36,6 +38,10 @@ _CHUNK_BYTES = 8 << 20
 _UNFINISHED = ".unfinished-"
 # A build takes seconds: what is older was interrupted.
 _STALE_SECONDS = 3600.0
+# A file that changed less than this ago may change again without a sign: clocks tick slowly.
+_SETTLED_NS = 2_000_000_000
+# Copies of a bundle on one machine.
+_MOST_SEEN = 16
 
 
 class Entry(Struct, frozen=True, forbid_unknown_fields=True):
@@ -47,6 +53,16 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True):
     processor: str
     graph_sha256: str
     weights_sha256: str
+
+
+class FileIdentity(Struct, frozen=True, array_like=True):
+    """What the system says of a file; its ``ctime_ns`` moves with every change of it."""
+
+    device: int
+    inode: int
+    size: int
+    mtime_ns: int
+    ctime_ns: int
 
 
 @dataclass(frozen=True)
@@ -120,6 +136,23 @@ class ModelCache:
             return Prepared(folder, graph)
         self.forget(model_sha256)
         return None
+
+    def knows(self, prepared: Prepared, model: Path) -> bool:
+        """Whether this very model file has had its digest taken, and has not changed since."""
+        return identity(model) in _seen(prepared)
+
+    def remember(self, prepared: Prepared, model: Path, before: FileIdentity | None) -> None:
+        """Note a model file whose digest was right; ``before`` is what it was before that."""
+        if before is None or before != identity(model):
+            return
+        if time.time_ns() - max(before.ctime_ns, before.mtime_ns) < _SETTLED_NS:
+            return
+        seen = [*_seen(prepared), before][-_MOST_SEEN:]
+        with contextlib.suppress(OSError):
+            descriptor, partial = tempfile.mkstemp(prefix=SEEN_FILE, dir=prepared.folder)
+            with os.fdopen(descriptor, "wb") as stream:
+                stream.write(msgspec.json.encode(seen))
+            Path(partial).replace(prepared.folder / SEEN_FILE)
 
     def new_folder(self) -> Path | None:
         """Return a folder to write an entry's files to; None where none can be made."""
@@ -216,6 +249,27 @@ class ModelCache:
     def _entry_folder(self, model_sha256: str) -> Path:
         key = "\n".join((model_sha256, _onnxruntime_version(), _processor()))
         return self.folder / hashlib.sha256(key.encode()).hexdigest()[:32]
+
+
+def identity(path: Path) -> FileIdentity | None:
+    """Return what the system says of a regular file, None where there is none."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    if not stat.S_ISREG(found.st_mode):
+        return None
+    return FileIdentity(
+        found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+    )
+
+
+def _seen(prepared: Prepared) -> list[FileIdentity]:
+    try:
+        content = (prepared.folder / SEEN_FILE).read_bytes()
+        return msgspec.json.decode(content, type=list[FileIdentity])
+    except (OSError, msgspec.DecodeError):
+        return []
 
 
 def file_digest(path: Path) -> str:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -189,6 +190,9 @@ def refuse_negative(entry: Threshold, what: str) -> None:
         )
 
 
+@lru_cache(maxsize=64)
 def infinite_where_null(q_hat: SixOrUnbounded) -> Array:
-    """A stored threshold -> numbers (6,), infinite where it is unbounded."""
-    return np.array([np.inf if q is None else q for q in q_hat])
+    """A stored threshold -> numbers (6,), infinite where it is unbounded; not to be written to."""
+    numbers = np.array([np.inf if q is None else q for q in q_hat])
+    numbers.setflags(write=False)
+    return numbers

@@ -13,10 +13,17 @@ import numpy as np
 import pytest
 
 from cvo_edge.artifact import Bundle, read_bundle
-from cvo_edge.errors import BundleMismatchError, UsageError
+from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 from cvo_edge.loading import PreparedBundle, load_bundle
 from cvo_edge.odometer import Odometer
-from cvo_edge.prepared import ENTRY_FILE, GRAPH_FILE, WEIGHTS_FILE, ModelCache, file_digest
+from cvo_edge.prepared import (
+    ENTRY_FILE,
+    GRAPH_FILE,
+    SEEN_FILE,
+    WEIGHTS_FILE,
+    ModelCache,
+    file_digest,
+)
 from cvo_edge.sources import open_source
 
 CVO_EDGE = [sys.executable, "-c", "from cvo_edge.cli import main; main()"]
@@ -85,6 +92,55 @@ def test_a_swapped_model_is_refused_whatever_the_cache_holds(copied_bundle, cach
     path.write_bytes(path.read_bytes() + b"\0")
     with pytest.raises(BundleMismatchError, match=hashlib.sha256(path.read_bytes()).hexdigest()):
         Odometer.load(copied_bundle, cache=cache)
+
+
+@pytest.fixture
+def settled(monkeypatch):
+    """Files count as settled at once."""
+    monkeypatch.setattr("cvo_edge.prepared._SETTLED_NS", 0)
+
+
+def test_the_digest_of_an_unchanged_model_is_taken_once(copied_bundle, cache, settled, monkeypatch):
+    load_bundle(copied_bundle, cache)
+    load_bundle(copied_bundle, cache)
+    taken = []
+    monkeypatch.setattr("cvo_edge.loading.check_model_file", lambda *_: taken.append(1))
+    load_bundle(copied_bundle, cache)
+    assert not taken
+    (copied_bundle / "model.onnx").touch()
+    load_bundle(copied_bundle, cache)
+    assert taken
+
+
+def test_a_model_of_the_same_size_and_times_is_refused(copied_bundle, cache, settled):
+    for _ in range(2):
+        load_bundle(copied_bundle, cache)
+    path = copied_bundle / "model.onnx"
+    before = path.stat()
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert (path.stat().st_size, path.stat().st_mtime_ns) == (before.st_size, before.st_mtime_ns)
+    with pytest.raises(BundleMismatchError):
+        load_bundle(copied_bundle, cache)
+
+
+def test_a_file_that_has_just_changed_is_not_remembered(copied_bundle, cache):
+    (copied_bundle / "model.onnx").touch()
+    for _ in range(2):
+        load_bundle(copied_bundle, cache)
+    assert not (entry_folder(cache) / SEEN_FILE).exists()
+
+
+def test_a_link_in_place_of_a_model_is_refused(copied_bundle, cache, settled, tmp_path):
+    for _ in range(2):
+        load_bundle(copied_bundle, cache)
+    path = copied_bundle / "model.onnx"
+    path.rename(tmp_path / "elsewhere.onnx")
+    path.symlink_to(tmp_path / "elsewhere.onnx")
+    with pytest.raises(ModelError):
+        load_bundle(copied_bundle, cache)
 
 
 def test_a_folder_that_others_may_write_to_is_not_used(bundle_dir, cache):
