@@ -8,12 +8,14 @@ METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 CLIP := calibration_artifacts/synthetic-room-clip
 
-.PHONY: help demo test check format clean
+.PHONY: help demo test check format clean bench soak
 
 help:
 	@echo "make demo    install the runtime alone and run the demonstration bundles on a sample clip"
 	@echo "make test    install both packages and run the test-suite (CVO_DATA: real data, optional)"
 	@echo "make check   lint, formatting, types and import rules"
+	@echo "make bench   compare speed, memory and start side by side; half an hour on a quiet machine"
+	@echo "make soak    a million frames: does memory grow? half an hour"
 	@echo "make format  reformat the code"
 	@echo "make clean   remove both virtual environments"
 
@@ -46,6 +48,19 @@ check: $(VENV)/.installed
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
+
+# One after the other: nothing may run beside a measurement.
+bench: $(VENV)/.installed
+	$(VENV)/bin/python bench/networks.py
+	$(VENV)/bin/python bench/frame.py
+	$(VENV)/bin/python bench/stream.py
+	$(VENV)/bin/python bench/start.py
+	$(VENV)/bin/python bench/scaling.py
+	$(VENV)/bin/python bench/peers.py
+	$(VENV)/bin/python bench/goals.py
+
+soak: $(VENV)/.installed
+	$(VENV)/bin/python bench/soak.py
 
 format: $(VENV)/.installed
 	$(VENV)/bin/ruff check --fix .

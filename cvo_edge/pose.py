@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import product
-from statistics import NormalDist
 from typing import Any, Literal
 
 import numpy as np
@@ -388,6 +387,9 @@ class PoseInterval:
         z is the normal quantile of the marginal confidence. A convention for filters that want a
         covariance; the guarantee is that of the interval alone.
         """
+        # Not for every start: it brings in fractions and decimals.
+        from statistics import NormalDist
+
         z = NormalDist().inv_cdf(0.5 + 0.5 * self.confidence)
         return np.diag(((self.upper - self.lower) / (2.0 * z)) ** 2)
 

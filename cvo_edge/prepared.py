@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib.metadata
 import os
 import platform
 import shutil
@@ -291,7 +290,11 @@ def file_digest(path: Path) -> str:
 
 
 def _onnxruntime_version() -> str:
-    return importlib.metadata.version("onnxruntime")
+    # Not at the top: a cache is listed and cleared without the engine. Asking the installed
+    # package's metadata instead takes as long as opening a small model.
+    from onnxruntime import __version__ as version
+
+    return str(version)
 
 
 def _processor() -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import os
 import platform
 import resource
@@ -91,6 +90,9 @@ def waited_for_cores_s() -> float:
 
 def environment(threads: int | None = None) -> dict[str, Any]:
     """Return what a reader needs to judge a latency: processor, cores, versions, governor."""
+    # Not for every start of a program that is not asked for it.
+    import importlib.metadata
+
     versions = {"python": platform.python_version()}
     for package in ("cvo-edge", "numpy", "onnxruntime", "opencv-python-headless", "msgspec"):
         try:

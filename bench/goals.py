@@ -1,0 +1,210 @@
+"""The goals for two cores, beside what was measured: a table from ``results/speed``.
+
+    python bench/goals.py
+
+Reads what the other programs of this folder wrote, prints the table and writes it as
+``results/speed/goals.md``. A goal that was missed is named as such; what was not measured here is
+a dash.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from networks import METHODS
+from rounds import RESULTS
+
+MOBILENET, RESNET = "mobilenetv2_100", "resnet34"
+PRECISION_RESULTS = RESULTS.parent / "int8"
+
+
+@dataclass(frozen=True)
+class Goal:
+    """One line: what, a figure for each backbone, and the bound of each."""
+
+    what: str
+    figure: Callable[[str], float | None]
+    bounds: dict[str, float]
+    at_least: bool = False
+    form: str = "{:.3f}"
+
+    def cells(self) -> list[str]:
+        """Return goal and figures as text."""
+        sign = ">=" if self.at_least else "<="
+        bounds = list(dict.fromkeys(self.form.format(bound) for bound in self.bounds.values()))
+        row = [self.what, f"{sign} {' / '.join(bounds)}"]
+        for backbone in (MOBILENET, RESNET):
+            found = self.figure(backbone) if backbone in self.bounds else None
+            if found is None:
+                row.append("-")
+                continue
+            bound = self.bounds[backbone]
+            reached = found >= bound if self.at_least else found <= bound
+            row.append(self.form.format(found) + ("" if reached else " (missed)"))
+        return row
+
+
+def report(name: str) -> dict[str, Any] | None:
+    """Return the results of one program, None where it has not been run."""
+    path = RESULTS / f"{name}.json"
+    if not path.exists():
+        return None
+    results: dict[str, Any] = json.loads(path.read_text("utf-8"))["results"]
+    return results
+
+
+def at(name: str, *keys: str) -> Callable[[str], float | None]:
+    """Return a reader of one figure; ``{}`` among the keys stands for the backbone."""
+
+    def read(backbone: str) -> float | None:
+        found: Any = report(name)
+        for key in keys:
+            if found is None:
+                return None
+            found = found.get(key.format(backbone))
+        return None if found is None else float(found)
+
+    return read
+
+
+def both(low: float, high: float) -> dict[str, float]:
+    """One bound for MobileNetV2, one for ResNet34."""
+    return {MOBILENET: low, RESNET: high}
+
+
+def worst_width(backbone: str) -> float | None:
+    """Return the largest ratio of mean widths, int8 over fp32, of the methods' medians."""
+    ratios: dict[tuple[str, str], list[float]] = {}
+    for path in sorted(PRECISION_RESULTS.glob("*.json")):
+        found = json.loads(path.read_text("utf-8"))
+        if found["backbone"] == backbone:
+            ratios.setdefault((found["dataset"], found["method"]), []).append(found["width_ratio"])
+    return max((float(np.median(values)) for values in ratios.values()), default=None)
+
+
+def goals() -> list[Goal]:
+    """Return the goals, in the order of the design."""
+    rows = []
+    for method in METHODS:
+        rows.append(
+            Goal(
+                f"array to intervals over the raw call, {method}",
+                at("frame", "{}", method, "fp32", "step_over_raw", "median"),
+                both(1.05, 1.05),
+            )
+        )
+    rows.append(
+        Goal(
+            "JPEG file to JSON record over the raw call, cjp",
+            at("frame", "{}", "cjp", "fp32", "record_over_raw", "median"),
+            both(1.5, 1.1),
+        )
+    )
+    for method in METHODS:
+        rows += [
+            Goal(
+                f"demonstration's network, {method}: array to intervals less the raw call, ms",
+                at("frame", "demonstration", method, "fp32", "step_minus_raw_ms", "median"),
+                {MOBILENET: 0.25},
+            ),
+            Goal(
+                f"demonstration's network, {method}: JPEG file to JSON record over the raw call",
+                at("frame", "demonstration", method, "fp32", "record_over_raw", "median"),
+                {MOBILENET: 1.6},
+            ),
+        ]
+    for method, bound in zip(METHODS, (0.04, 0.25, 0.06, 0.10), strict=True):
+        rows.append(
+            Goal(
+                f"cost of uncertainty, {method}",
+                at("frame", "{}", method, "fp32", "cost_of_uncertainty"),
+                both(bound, bound),
+            )
+        )
+    return [
+        *rows,
+        Goal(
+            "raw call: float32 over 8 bits",
+            at("frame", "{}", "cjp", "fp32_over_int8", "median"),
+            both(1.4, 2.5),
+            at_least=True,
+            form="{:.2f}",
+        ),
+        Goal("width: 8 bits over float32, the widest method", worst_width, both(1.1, 1.1)),
+        Goal(
+            "throughput over a naive script, 8 bits",
+            at("stream", "{}", "throughput", "throughput int8", "naive_over_this", "median"),
+            {MOBILENET: 2.5},
+            at_least=True,
+            form="{:.2f}",
+        ),
+        Goal(
+            "one frame against 30 passes of MC-dropout, the fastest form",
+            at("peers", "{}", "uncertainty", "mc_dropout_over_ours"),
+            both(20, 20),
+            at_least=True,
+            form="{:.1f}",
+        ),
+        Goal(
+            "one frame against five networks, the fastest form",
+            at("peers", "{}", "uncertainty", "ensemble_over_ours"),
+            both(5, 5),
+            at_least=True,
+            form="{:.1f}",
+        ),
+        Goal(
+            "processor time a frame at 30 a second over onnxruntime's, 2 threads",
+            at("stream", "{}", "camera", "live fp32, 2", "over_onnxruntime", "median"),
+            both(0.3, 0.3),
+        ),
+        Goal(
+            "the same, 8 bits, 1 thread",
+            at("stream", "{}", "camera", "live int8, 1", "over_onnxruntime", "median"),
+            both(0.15, 0.15),
+        ),
+        Goal(
+            "load with a warm cache over plain onnxruntime",
+            at("start", "{}", "load", "cvo-edge fp32", "load_ms", "over_onnxruntime"),
+            both(0.45, 0.15),
+        ),
+        Goal(
+            "anonymous memory over plain onnxruntime, 8 bits",
+            at("start", "{}", "load", "cvo-edge int8", "anonymous_mib", "over_onnxruntime"),
+            {MOBILENET: 0.6},
+        ),
+        Goal(
+            "anonymous memory over plain onnxruntime, float32",
+            at("start", "{}", "load", "cvo-edge fp32", "anonymous_mib", "over_onnxruntime"),
+            {RESNET: 0.2},
+        ),
+        Goal(
+            "fresh process to first interval over the smallest script",
+            at("start", "{}", "process", "over_script", "median"),
+            both(1.15, 1.15),
+        ),
+        Goal(
+            "growth of memory over a million frames, MiB",
+            at("soak", "growth_mib", "rss"),
+            {MOBILENET: 10},
+            form="{:.1f}",
+        ),
+    ]
+
+
+def main() -> None:
+    """Print and write the table."""
+    rows = [["what", "goal", "MobileNetV2", "ResNet34"], ["---"] * 4]
+    rows += [goal.cells() for goal in goals()]
+    text = "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
+    print(text, end="")
+    target: Path = RESULTS / "goals.md"
+    target.write_text(text, "utf-8")
+
+
+if __name__ == "__main__":
+    main()
