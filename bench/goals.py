@@ -89,15 +89,14 @@ def worst_width(backbone: str) -> float | None:
 
 def goals() -> list[Goal]:
     """Return the goals, in the order of the design."""
-    rows = []
-    for method in METHODS:
-        rows.append(
-            Goal(
-                f"array to intervals over the raw call, {method}",
-                at("frame", "{}", method, "fp32", "step_over_raw", "median"),
-                both(1.05, 1.05),
-            )
+    rows = [
+        Goal(
+            f"array to intervals over the raw call, {method}",
+            at("frame", "{}", method, "fp32", "step_over_raw", "median"),
+            both(1.05, 1.05),
         )
+        for method in METHODS
+    ]
     rows.append(
         Goal(
             "JPEG file to JSON record over the raw call, cjp",
