@@ -12,9 +12,10 @@ from cvo_edge.trajectory import open_ground_truth
 
 ARTIFACTS = Path(__file__).resolve().parents[2] / "calibration_artifacts"
 METHODS = ["cjp", "cqr", "csp", "mcqr"]
+NAMES = [f"{method}{suffix}" for method in METHODS for suffix in ("", "-int8")]
 
 
-@pytest.fixture(params=METHODS)
+@pytest.fixture(params=NAMES)
 def demonstration(request):
     return ARTIFACTS / f"synthetic-room-{request.param}"
 
@@ -23,7 +24,23 @@ def test_it_passes_its_self_test_and_is_of_its_method(demonstration):
     with Odometer.load(demonstration) as odometer:
         assert check_selftest(odometer) < odometer.calibration.selftest.tolerance
         assert odometer.calibration.name == demonstration.name
-        assert demonstration.name.endswith(odometer.calibration.method)
+        method, _, precision = demonstration.name.removeprefix("synthetic-room-").partition("-")
+        assert odometer.calibration.method == method
+        assert odometer.calibration.model.precision == (precision or "fp32")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_eight_bits_cost_little_and_the_file_is_smaller(method, clip_dir):
+    plain, int8 = (ARTIFACTS / f"synthetic-room-{method}{suffix}" for suffix in ("", "-int8"))
+    sizes = [(folder / "model.onnx").stat().st_size for folder in (plain, int8)]
+    assert sizes[0] - sizes[1] > 2**20
+    frames = list(open_source(str(clip_dir)))
+    with Odometer.load(plain) as first, Odometer.load(int8) as second:
+        widths = [
+            np.mean([e.region.width() for e in odometer.stream(frames)], axis=0)
+            for odometer in (first, second)
+        ]
+    assert np.mean(widths[1] / widths[0]) < 1.1
 
 
 def test_it_is_small_enough_for_a_repository(demonstration):
