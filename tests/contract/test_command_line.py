@@ -96,8 +96,11 @@ def test_a_reader_that_leaves_ends_it_quietly(bundle_dir, clip_dir):
         assert process.wait(60) == 0
 
 
+@pytest.mark.parametrize("mode", ["latency", "throughput", "live"])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_it_with_every_record_whole(bundle_dir, clip_dir, tmp_path, number, code):
+def test_a_signal_ends_it_with_every_record_whole(
+    bundle_dir, clip_dir, tmp_path, number, code, mode
+):
     # Links to one image make a source that is long enough to be interrupted.
     image = next(iter(sorted(clip_dir.glob("*.color.jpg"))))
     frames = tmp_path / "frames"
@@ -107,8 +110,9 @@ def test_a_signal_ends_it_with_every_record_whole(bundle_dir, clip_dir, tmp_path
             frames / f"{index}.jpg"
         ).symlink_to(image)
     out = tmp_path / "out.jsonl"
+    options = ["-o", str(out), "--quiet", "--mode", mode, "--fps", "50"]
     with subprocess.Popen(
-        [*FOREGROUND, "run", str(bundle_dir), str(frames), "-o", str(out), "--quiet"],
+        [*FOREGROUND, "run", str(bundle_dir), str(frames), *options],
         stderr=subprocess.PIPE,
     ) as process:
         deadline = time.monotonic() + 60
@@ -121,7 +125,10 @@ def test_a_signal_ends_it_with_every_record_whole(bundle_dir, clip_dir, tmp_path
     content = out.read_text()
     assert content.endswith("\n")
     sequence = [json.loads(line)["seq"] for line in content.splitlines()]
-    assert sequence == list(range(len(sequence)))
+    if mode == "live":  # what the network was too slow for is missing
+        assert sequence == sorted(set(sequence))
+    else:
+        assert sequence == list(range(len(sequence)))
     assert 0 < len(sequence) < 20_000
 
 
