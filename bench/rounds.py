@@ -10,7 +10,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, sleep
 from typing import Any
 
 import numpy as np
@@ -23,11 +23,16 @@ Array = NDArray[np.float64]
 
 
 def interleaved(
-    calls: Mapping[str, Callable[[int], object]], *, rounds: int, warmup: int
+    calls: Mapping[str, Callable[[int], object]],
+    *,
+    rounds: int,
+    warmup: int,
+    pause_s: float = 0.0,
 ) -> dict[str, Array]:
     """Milliseconds of each call in each round, (rounds,); a call is given the round's number.
 
-    Who begins changes from round to round: whoever comes later finds warmer caches.
+    Who begins changes from round to round: whoever comes later finds warmer caches. With a
+    pause behind each call, threads that go on looking for work do not slow down the next one.
     """
     names = list(calls)
     spent = {name: np.empty(warmup + rounds) for name in names}
@@ -37,6 +42,7 @@ def interleaved(
             begin = perf_counter()
             calls[name](number)
             spent[name][number] = 1e3 * (perf_counter() - begin)
+            sleep(pause_s)
     return {name: values[warmup:] for name, values in spent.items()}
 
 

@@ -1,0 +1,310 @@
+"""Other engines on the same two cores: the network of a CJP bundle, in turns with ours.
+
+    pip install -e ".[peers]"
+    python bench/peers.py
+
+Whole MobileNetV2 and ResNet34 at 224x224, one frame, two threads for each engine. Ours is timed
+from an array of 640x480 to intervals; a peer from an input that is ready to pose and bounds, which
+spares it the work around the network. Of peers that are not installed one line says so, and nobody
+is timed whose numbers are not ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property, partial
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnxruntime
+import torch
+from networks import BACKBONES, WORK, images, whole_bundle
+from numpy.typing import NDArray
+from rounds import Array, figures, interleaved, ratio, write_report
+
+from cvo_edge import preprocess
+from cvo_edge.odometer import Odometer
+from cvo_export.run import PoseGraph, load_run
+
+THREADS, ROUNDS, WARM_UP = 2, 100, 10
+PAUSE_S = 0.01
+# Of a float32 peer's numbers from ours: in metres, radians and quaternion units, and in standard
+# deviations of that output over the images that are compared.
+LARGEST_DIFFERENCE, LARGEST_SHARE = 1e-3, 0.1
+# Of what our own 8 bits change in the outputs: what another reduced precision may change.
+LARGEST_ROUNDING = 5.0
+
+Outputs = list[NDArray[np.float32]]
+Call = Callable[[preprocess.Image], Outputs]
+
+
+class Network:
+    """What the engines load: one backbone's CJP network in every form that one of them reads."""
+
+    def __init__(self, backbone: str) -> None:
+        self.backbone = backbone
+        self.frames = [model_input(image) for image in images()]
+        self.converted = WORK / "peers"
+        self.converted.mkdir(parents=True, exist_ok=True)
+
+    def onnx(self, precision: str) -> str:
+        """Path of the bundle's graph."""
+        return str(self.bundle(precision) / "model.onnx")
+
+    def bundle(self, precision: str) -> Path:
+        """Folder of the bundle."""
+        return whole_bundle("cjp", self.backbone, precision)
+
+    @cached_property
+    def graph(self) -> PoseGraph:
+        """The network before its export."""
+        self.bundle("fp32")
+        return load_run(WORK / "runs" / f"cjp-{self.backbone}").graph
+
+
+class Normalised(torch.nn.Module):
+    """The network behind its normalisation, for engines that do not take 8-bit pixels."""
+
+    def __init__(self, graph: PoseGraph) -> None:
+        super().__init__()
+        self.graph = graph
+
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Image (1, 3, height, width), normalised -> pose, lower, upper."""
+        backbone = self.graph.backbone
+        feature_map = backbone.body.forward_features(image)
+        outputs: tuple[torch.Tensor, ...] = self.graph.head(feature_map.mean(dim=(2, 3)))
+        return outputs
+
+
+class Peer(NamedTuple):
+    """An engine: the precision it computes in, its packages, and how it loads a network."""
+
+    precision: str
+    packages: tuple[str, ...]
+    load: Callable[[Network], Call]
+
+
+def model_input(image_bgr: preprocess.Image) -> preprocess.Image:
+    """Return the bundles' input, (1, 224, 224, 3) uint8 RGB."""
+    return preprocess.model_input(image_bgr, 224, 224, "centre")
+
+
+def onnxruntime_defaults(network: Network, precision: str) -> Call:
+    """Load the graph with nothing but the number of threads."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = THREADS
+    session = onnxruntime.InferenceSession(network.onnx(precision), options)
+    return lambda image: session.run(None, {"image": image})
+
+
+def torch_eager(network: Network) -> Call:
+    """Run the graph as it was trained."""
+    torch.set_num_threads(THREADS)
+    graph = network.graph
+
+    def call(image: preprocess.Image) -> Outputs:
+        with torch.inference_mode():
+            return [values.numpy() for values in graph(torch.from_numpy(image))]
+
+    return call
+
+
+def openvino(network: Network, precision: str, hint: str = "f32") -> Call:
+    """Compile our graph for the least latency, in the precision that is hinted."""
+    import openvino as ov
+
+    settings = {
+        "PERFORMANCE_HINT": "LATENCY",
+        "NUM_STREAMS": 1,
+        "INFERENCE_NUM_THREADS": THREADS,
+        "INFERENCE_PRECISION_HINT": hint,
+    }
+    request = (
+        ov.Core().compile_model(network.onnx(precision), "CPU", settings).create_infer_request()
+    )
+
+    def call(image: preprocess.Image) -> Outputs:
+        found = request.infer([image], share_inputs=True, share_outputs=True)
+        return [found[index] for index in range(3)]
+
+    return call
+
+
+def openvino_own_choice() -> str:
+    """Return what OpenVINO computes float32 graphs in on this processor unless told otherwise."""
+    import openvino as ov
+
+    return str(ov.Core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name())
+
+
+def litert(network: Network) -> Call:
+    """Convert the torch graph, 8-bit pixels and all; its kernels on x86-64 are XNNPACK's."""
+    from ai_edge_litert.interpreter import Interpreter
+
+    path = network.converted / f"{network.backbone}.tflite"
+    if not path.exists():
+        import litert_torch
+
+        example = torch.from_numpy(network.frames[0])
+        litert_torch.convert(network.graph, (example,)).export(str(path))
+    interpreter = Interpreter(str(path), num_threads=THREADS)
+    interpreter.allocate_tensors()
+    target = interpreter.get_input_details()[0]["index"]
+    sources = [detail["index"] for detail in interpreter.get_output_details()]
+
+    def call(image: preprocess.Image) -> Outputs:
+        interpreter.set_tensor(target, image)
+        interpreter.invoke()
+        return [interpreter.get_tensor(source) for source in sources]
+
+    return call
+
+
+def ncnn(network: Network) -> Call:
+    """Convert the torch graph; pixels are cast and normalised by ncnn's own functions."""
+    import ncnn as engine
+
+    path = network.converted / f"{network.backbone}.ncnn.param"
+    if not path.exists():
+        import pnnx
+
+        size = network.frames[0].shape[1:3]
+        # In a folder of its own: the converter leaves half a dozen files beside its result.
+        stem = network.converted / f"{network.backbone}.pt"
+        pnnx.export(Normalised(network.graph), str(stem), (torch.zeros(1, 3, *size),))
+    net = engine.Net()
+    net.opt.num_threads = THREADS
+    # Else weights and feature maps are rounded to 16 bits where the processor has them.
+    net.opt.use_fp16_packed = net.opt.use_fp16_storage = net.opt.use_fp16_arithmetic = False
+    net.opt.use_bf16_storage = False
+    net.load_param(str(path))
+    net.load_model(str(path.with_suffix(".bin")))
+    backbone = network.graph.backbone
+    mean = [255.0 * value for value in backbone.mean]
+    scale = [1.0 / (255.0 * value) for value in backbone.std]
+
+    def call(image: preprocess.Image) -> Outputs:
+        height, width = image.shape[1:3]
+        pixels = engine.Mat.from_pixels(image[0], engine.Mat.PixelType.PIXEL_RGB, width, height)
+        pixels.substract_mean_normalize(mean, scale)
+        with net.create_extractor() as extractor:
+            extractor.input("in0", pixels)
+            return [np.array(extractor.extract(f"out{index}")[1]) for index in range(3)]
+
+    return call
+
+
+PEERS = {
+    "onnxruntime defaults": Peer("fp32", (), partial(onnxruntime_defaults, precision="fp32")),
+    "torch eager": Peer("fp32", (), torch_eager),
+    "openvino": Peer("fp32", ("openvino",), partial(openvino, precision="fp32")),
+    "litert": Peer("fp32", ("ai-edge-litert", "litert-torch"), litert),
+    "ncnn": Peer("fp32", ("ncnn", "pnnx"), ncnn),
+    "openvino bf16": Peer("bf16", ("openvino",), partial(openvino, precision="fp32", hint="bf16")),
+    "onnxruntime defaults int8": Peer("int8", (), partial(onnxruntime_defaults, precision="int8")),
+    "openvino int8": Peer("int8", ("openvino",), partial(openvino, precision="int8")),
+}
+
+
+def missing(peer: Peer) -> list[str]:
+    """Return which of a peer's packages are not installed."""
+    modules = {name: name.replace("-", "_") for name in peer.packages}
+    return [name for name, module in modules.items() if find_spec(module) is None]
+
+
+def compared_images(network: Network) -> list[preprocess.Image]:
+    """Return inputs on which outputs differ: frames, the self-test's rings, noise, black, white."""
+    noise = np.random.default_rng(0).integers(0, 256, network.frames[0].shape, dtype=np.uint8)
+    rings = model_input(preprocess.selftest_image(480, 640))
+    return [*network.frames[::10], rings, noise, np.zeros_like(noise), np.full_like(noise, 255)]
+
+
+def numbers(call: Call, inputs: list[preprocess.Image]) -> Array:
+    """Pose, lower and upper of every input in one row, (inputs, 19)."""
+    return np.array([np.concatenate([out.ravel() for out in call(one)]) for one in inputs], float)
+
+
+def network_of(odometer: Odometer) -> Call:
+    """Return our call of the network alone."""
+    if odometer.session is None:
+        raise SystemExit("expected an open odometer, found a closed one")
+    engine = odometer.session.engine
+    return lambda image: engine.run(["pose", "lower", "upper"], {"image": image})
+
+
+def measured(backbone: str, peers: dict[str, Peer]) -> dict[str, Any]:
+    """Compare and time all engines on one network."""
+    network = Network(backbone)
+    pictures, inputs = images(), compared_images(network)
+    ours = {p: Odometer.load(network.bundle(p), threads=THREADS) for p in ("fp32", "int8")}
+    exact, rounded = (numbers(network_of(odometer), inputs) for odometer in ours.values())
+    rounding = float(np.abs(rounded - exact).max())
+    found: dict[str, Any] = {}
+    calls: dict[str, Callable[[int], object]] = {}
+    for precision, odometer in ours.items():
+        calls[f"ours {precision}"] = lambda n, step=odometer.step: step(pictures[n % len(pictures)])
+    for name, peer in peers.items():
+        call = peer.load(network)
+        off = np.abs(numbers(call, inputs) - exact)
+        difference, share = float(off.max()), float((off / exact.std(axis=0)).max())
+        found[name] = {
+            "precision": peer.precision,
+            "largest_difference": float(f"{difference:.3g}"),
+            "largest_difference_in_deviations": float(f"{share:.3g}"),
+            "versions": {package: version(package) for package in peer.packages},
+        }
+        if peer.precision == "fp32":
+            right = difference <= LARGEST_DIFFERENCE and share <= LARGEST_SHARE
+        else:
+            right = difference <= LARGEST_ROUNDING * rounding
+        # Written so that NaN is refused.
+        if right:
+            frames = network.frames
+            calls[name] = lambda n, call=call, frames=frames: call(frames[n % len(frames)])
+    spent = interleaved(calls, rounds=ROUNDS, warmup=WARM_UP, pause_s=PAUSE_S)
+    for name, ms in spent.items():
+        row = found.setdefault(name, {"precision": name.removeprefix("ours ")})
+        against = "fp32" if row["precision"] == "fp32" else "int8"
+        row |= {"ms": figures(ms), "over_ours": ratio(ms, spent[f"ours {against}"])}
+    found["ours int8"]["largest_difference"] = float(f"{rounding:.3g}")
+    return found
+
+
+def line(name: str, row: dict[str, Any]) -> str:
+    """Return one engine's figures as text."""
+    start = f"  {name:<26} {row['precision']:<5}"
+    difference = f"difference {row.get('largest_difference', 0.0):.1e}"
+    if "ms" not in row:
+        return f"{start} not timed: other numbers than ours, {difference}"
+    return (
+        f"{start} {row['ms']['median']:8.3f} ms (p95 {row['ms']['p95']:8.3f}), "
+        f"{row['over_ours']['median']:6.2f} times ours, {difference}"
+    )
+
+
+def main() -> None:
+    """Time all engines that are installed on both networks."""
+    absent = {name: missing(peer) for name, peer in PEERS.items()}
+    for name, packages in absent.items():
+        if packages:
+            print(f"{name}: {', '.join(packages)} not installed, left out")
+    present = {name: peer for name, peer in PEERS.items() if not absent[name]}
+    results: dict[str, Any] = {}
+    for backbone in BACKBONES:
+        results[backbone] = measured(backbone, present)
+        print(f"{backbone}, {THREADS} threads")
+        for name, row in results[backbone].items():
+            print(line(name, row), flush=True)
+    if "openvino" in present:
+        results["openvino_own_choice"] = openvino_own_choice()
+        print(f"OpenVINO computes float32 graphs in {results['openvino_own_choice']} unless told")
+    results["left_out"] = {name: packages for name, packages in absent.items() if packages}
+    write_report("peers", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP, pause_s=PAUSE_S)
+
+
+if __name__ == "__main__":
+    main()
