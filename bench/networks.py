@@ -13,11 +13,15 @@ import subprocess
 import sys
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import onnx
 from onnx.utils import Extractor
+
+if TYPE_CHECKING:
+    from torch import nn
 
 ROOT = Path(__file__).resolve().parent.parent
 WORK = ROOT / "build" / "bench"
@@ -51,11 +55,7 @@ def published(name: str, precision: str, what: str, options: str) -> Path:
 
 
 def _random_weights(backbone: str) -> Path:
-    """Return the file of a backbone's random weights, none of whose branches is zero.
-
-    Residual branches begin with a factor of zero. An engine that folds constants would leave them
-    out, and so be timed on a seventh of ResNet34; and 8 bits would have nothing to round.
-    """
+    """Return the file of a backbone's random weights, made now if it is not there."""
     path = WORK / f"{backbone}-random.safetensors"
     if not path.exists():
         import timm
@@ -65,11 +65,20 @@ def _random_weights(backbone: str) -> Path:
         WORK.mkdir(parents=True, exist_ok=True)
         torch.manual_seed(0)
         body = timm.create_model(backbone, pretrained=False, num_classes=0)
-        for module in body.modules():
-            if isinstance(module, torch.nn.BatchNorm2d) and not module.weight.any():
-                torch.nn.init.ones_(module.weight)
+        open_branches(body)
         save_file(body.state_dict(), path)
     return path
+
+
+def open_branches(body: nn.Module) -> None:
+    """Give every branch of an untrained network that begins with a factor of zero one of one.
+
+    So do residual branches. An engine that folds constants would leave them out, and be timed on a
+    fraction of ResNet34; and 8 bits would have nothing to round.
+    """
+    for name, values in body.named_parameters():
+        if name.endswith("weight") and not values.any():
+            values.data.fill_(1.0)
 
 
 def demonstration(method: str, precision: str = "fp32") -> Path:
