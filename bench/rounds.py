@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import perf_counter, sleep
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from cvo_edge.profile import environment
 
 RESULTS = Path(__file__).parent / "results" / "speed"
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 
 def interleaved(
@@ -44,6 +45,11 @@ def interleaved(
             spent[name][number] = 1e3 * (perf_counter() - begin)
             sleep(pause_s)
     return {name: values[warmup:] for name, values in spent.items()}
+
+
+def over(inputs: Sequence[T], call: Callable[[T], object]) -> Callable[[int], object]:
+    """Return a call for ``interleaved`` that is given one input a round, in their order."""
+    return lambda number: call(inputs[number % len(inputs)])
 
 
 def figures(values: Array) -> dict[str, float]:
