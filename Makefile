@@ -57,6 +57,7 @@ bench: $(VENV)/.installed
 	$(VENV)/bin/python bench/start.py
 	$(VENV)/bin/python bench/scaling.py
 	$(VENV)/bin/python bench/peers.py
+	$(VENV)/bin/python bench/uncertainty_peers.py
 	$(VENV)/bin/python bench/goals.py
 
 soak: $(VENV)/.installed

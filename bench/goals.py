@@ -144,14 +144,14 @@ def goals() -> list[Goal]:
         ),
         Goal(
             "one frame against 30 passes of MC-dropout, the fastest form",
-            at("peers", "{}", "uncertainty", "mc_dropout_over_ours"),
+            at("uncertainty_peers", "{}", "mc-dropout", "fastest_over_ours"),
             both(20, 20),
             at_least=True,
             form="{:.1f}",
         ),
         Goal(
             "one frame against five networks, the fastest form",
-            at("peers", "{}", "uncertainty", "ensemble_over_ours"),
+            at("uncertainty_peers", "{}", "ensemble", "fastest_over_ours"),
             both(5, 5),
             at_least=True,
             form="{:.1f}",

@@ -45,8 +45,6 @@ THREADS, ROUNDS, WARM_UP = 2, 30, 3
 # Threads of the naive forms look for work for milliseconds after a call.
 PAUSE_S = 0.01
 DROPOUT = 0.1
-# Ours is to be so many times as fast.
-GOALS = {"mc-dropout": 20.0, "ensemble": 5.0}
 NAIVE, SHARED = "naive", "one backbone"
 COMPARISONS = Path(__file__).parent / "results" / "compare"
 
@@ -231,15 +229,14 @@ def measured(backbone: str) -> dict[str, Any]:
     found: dict[str, Any] = {"ours": {"ms": figures(ours)}}
     for kind, named in kinds.items():
         times = {name: spent[f"{kind}, {name}"] for name in named}
-        best = min(set(times) - {SHARED}, key=lambda name: float(np.median(times[name])))
+        fastest = min(set(times) - {SHARED}, key=lambda name: float(np.median(times[name])))
         found[kind] = {
             "forms": {
                 name: {"ms": figures(ms), "over_ours": ratio(ms, ours)}
                 for name, ms in times.items()
             },
-            "best": best,
-            "goal": GOALS[kind],
-            "reached": bool(np.median(times[best] / ours) >= GOALS[kind]),
+            "fastest": fastest,
+            "fastest_over_ours": ratio(times[fastest], ours)["median"],
         }
     return found
 
@@ -250,7 +247,7 @@ def scores() -> dict[str, dict[str, float]]:
     for path in sorted(COMPARISONS.glob("*.json")):
         cells = json.loads(path.read_text("utf-8"))["cells"]
         row = found[path.stem] = {}
-        for method in ("cjp", *GOALS):
+        for method in ("cjp", "mc-dropout", "ensemble"):
             for bounds, name in (("own", f"{method}, own bounds"), ("marginal", method)):
                 found_scores = [
                     cell[bounds]["normalised_interval_score"]
@@ -263,20 +260,19 @@ def scores() -> dict[str, dict[str, float]]:
 
 
 def main() -> None:
-    """Time both on both networks; print what is reached, and the scores."""
+    """Time both on both networks; print times and scores."""
     results: dict[str, Any] = {}
     for backbone in BACKBONES:
         found = results[backbone] = measured(backbone)
         print(f"{backbone}: ours {found['ours']['ms']['median']:.3f} ms")
-        for kind, goal in GOALS.items():
+        for kind in ("mc-dropout", "ensemble"):
             row = found[kind]
             for name, form in row["forms"].items():
                 print(
                     f"  {kind:<10} {name:<22} {form['ms']['median']:9.3f} ms, "
                     f"{form['over_ours']['median']:6.2f} times ours"
                 )
-            judged = "reached" if row["reached"] else "missed"
-            print(f"  {kind:<10} goal {goal:g} times, of the {row['best']}: {judged}", flush=True)
+            print(f"  {kind:<10} fastest: {row['fastest']}", flush=True)
     results["interval_scores"] = scores()
     for recording, row in results["interval_scores"].items():
         print(f"scores, {recording}: {', '.join(f'{name} {x:.3f}' for name, x in row.items())}")
