@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
+FOLDER = ROOT / ".boards"
 
 # What tests/edge and pytest's settings in pyproject.toml need; the others are oracles.
 TEST_PACKAGES = ("pytest", "hypothesis", "pytest-timeout", "pytest-xdist")
@@ -47,31 +48,55 @@ class SetUpError(Exception):
 
 @dataclass(frozen=True)
 class Board:
-    """A processor to emulate; ``cpu`` is qemu's name of it."""
+    """A processor to emulate.
+
+    Attributes
+    ----------
+    name, meaning
+        For a command line and for a person.
+    emulator, cpu
+        qemu's program, and its name of the processor.
+    saturates
+        Whether 8-bit products saturate there, unless onnxruntime is told otherwise.
+    """
 
     name: str
+    meaning: str
     emulator: str
     cpu: str
-    meaning: str
+    saturates: bool
 
 
 BOARDS = {
     board.name: board
     for board in (
-        Board("arm64", "qemu-aarch64-static", "cortex-a72", "64-bit ARM, as in a Raspberry Pi 4"),
-        Board("avx2", "qemu-x86_64-static", "Haswell-noTSX,-pcid,-x2apic,-tsc-deadline,-invpcid", "x86-64 with AVX2, without AVX-512 or VNNI"),
+        Board(
+            "arm64",
+            "64-bit ARM, as in a Raspberry Pi 4",
+            "qemu-aarch64-static",
+            "cortex-a72",
+            saturates=False,
+        ),
+        Board(
+            "avx2",
+            "x86-64 with AVX2, without AVX-512 and VNNI",
+            "qemu-x86_64-static",
+            # Without the features that the emulator would say on stderr it has not.
+            "Haswell-noTSX,-pcid,-x2apic,-tsc-deadline,-invpcid",
+            saturates=True,
+        ),
     )
 }
 
 
 def set_up(board: Board) -> Path:
-    """Make the board's Python in ``.<name>/`` -> its path; what is there already is kept.
+    """Make the board's Python in ``.boards/<name>/`` -> its path; what is there already is kept.
 
     Raises SetUpError where something is missing or fails.
     """
     _install_emulator(board)
-    folder = ROOT / f".{board.name}"
-    folder.mkdir(exist_ok=True)
+    folder = FOLDER / board.name
+    folder.mkdir(parents=True, exist_ok=True)
     if board.name == "arm64":
         root = folder / "root"
         if not root.is_dir():
@@ -92,6 +117,12 @@ def set_up(board: Board) -> Path:
     python.chmod(0o755)
     _install_packages(folder, folder / "lib" / f"python{version}" / "site-packages", wheels)
     return python
+
+
+def emulator_version(board: Board) -> str:
+    """Name and version of the emulator, as it says."""
+    done = subprocess.run([board.emulator, "--version"], capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()[0]
 
 
 def requirements(project: Mapping[str, Any]) -> list[str]:
@@ -124,7 +155,7 @@ def _install_emulator(board: Board) -> None:
 
 
 def _extract_debian(folder: Path, root: Path) -> None:
-    """Fill ``root`` with Debian's Python for ARM, from packages that are unpacked, not installed."""
+    """Fill ``root`` with Debian's Python for ARM: packages are unpacked, none is installed."""
     for program in ("apt-get", "dpkg-deb"):
         if not shutil.which(program):
             raise SetUpError(f"{program}: not found; the ARM Python comes from Debian packages")
@@ -183,7 +214,7 @@ def _arm_wheel_options() -> list[str]:
 def _install_packages(folder: Path, site: Path, wheels: list[str]) -> None:
     """Install what the runtime and its tests need, in the releases that this Python has.
 
-    Other releases would compute other numbers on the same processor.
+    Others would compute other numbers on the same processor.
     """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     wanted = "\n".join(requirements(project)) + "\n"
@@ -199,8 +230,6 @@ def _install_packages(folder: Path, site: Path, wheels: list[str]) -> None:
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-compile", f"--target={site}"]
     files = (f"{folder}/requirements.txt", f"--constraint={folder}/constraints.txt")
     _call(*pip, *wheels, "--requirement", *files)
-    # The project's own code, as an editable install would have it.
-    (site / "project.pth").write_text(f"{ROOT}\n", "utf-8")
     stamp.write_text(state, "ascii")
 
 
