@@ -158,6 +158,8 @@ def difference(first: Records, second: Records, tolerance: Tolerance) -> Differe
     rotation = _largest(_angles(first.poses, second.poses))
     bounds = np.maximum(_gap(first.lower, second.lower), _gap(first.upper, second.upper))
     width = mean_width(first)
+    # What is unbounded on both has no width, and no difference.
+    shares = np.divide(bounds, width, out=np.zeros_like(bounds), where=bounds > 0.0)
     other_bands = first.bands != second.bands
     return Difference(
         frames=len(first.sources),
@@ -168,9 +170,9 @@ def difference(first: Records, second: Records, tolerance: Tolerance) -> Differe
         rotation_share=rotation / float(width[3:].mean()),
         bound_m=_largest(bounds[:, :3]),
         bound_rad=_largest(bounds[:, 3:]),
-        bound_share=_largest(bounds / width),
+        bound_share=_largest(shares),
         bands=int(other_bands.sum()),
-        moved=int((other_bands | (bounds / width > tolerance.share)).sum()),
+        moved=int((other_bands | (shares > tolerance.share)).sum()),
     )
 
 
@@ -219,11 +221,11 @@ def coverage(records: Records, chart: Chart, truth: Mapping[str, Array]) -> dict
 
 
 def _gap(first: Array, second: Array) -> Array:
-    """Absolute difference; 0 between two NaNs or equal infinities, else infinite where not finite."""
+    """Absolute difference: 0 between equals, NaN and infinity too; infinite beside one of those."""
     same = (first == second) | (np.isnan(first) & np.isnan(second))
     with np.errstate(invalid="ignore"):
-        gap = np.nan_to_num(np.abs(first - second), nan=math.inf)
-    return np.where(same, 0.0, gap)
+        gap = np.abs(first - second)
+    return np.where(same, 0.0, np.where(np.isfinite(gap), gap, math.inf))
 
 
 def _angles(first: Array, second: Array) -> Array:
