@@ -41,16 +41,14 @@ from cvo_edge.pose import Chart
 from cvo_edge.session import allowed_cores
 from cvo_edge.trajectory import MATRIX_SUFFIX, read_pose_matrix
 
-FRAMES = FOLDER / "frames"
 CONFIDENCE = 0.9
 
 # Those of the runtime alone that depend on the processor; other contracts need onnx, too.
 TESTS = ("tests/edge", "tests/contract/test_demonstrations.py")
 
-# An emulated inference takes about a second: that many frames of each of the 20 test flights, of
-# the joint scope, whose sets differ in their thresholds alone, those of four flights.
-FRAMES_PER_FLIGHT = 3
-FRAMES_OF_SCOPE = {"marginal": 60, "joint": 12}
+# In the joint scope sets differ from the others in their thresholds alone: the first fifth of the
+# frames will do, as an emulated inference takes a second.
+JOINT_SHARE = 5
 CONTROL_FRAMES = 5
 
 _RUNTIME = ("-c", "from cvo_edge.cli import main; main()")
@@ -63,21 +61,23 @@ def main() -> int:
     parser.add_argument(
         "--bundles", nargs="+", type=Path, default=demonstrations(), help="the repository's own"
     )
+    parser.add_argument("--frames-per-flight", type=int, default=5, help="of 20 test flights")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
-    board = BOARDS[options.board]
+    board, per_flight = BOARDS[options.board], options.frames_per_flight
+    frames = FOLDER / f"frames-{per_flight}"
     try:
         python = set_up(board)
         calibrations = {folder: read_calibration(folder) for folder in options.bundles}
         for calibration in calibrations.values():
-            write_test_frames(FRAMES, calibration.calibration.split, FRAMES_PER_FLIGHT)
+            write_test_frames(frames, calibration.calibration.split, per_flight)
     except (SetUpError, CvoError) as error:
         print(f"boards: {error}", file=sys.stderr)
         return 2
     print(f"== {board.meaning}: {emulator_version(board)}, {board.cpu}", flush=True)
     tests = run_tests(board, python)
     with ThreadPoolExecutor(allowed_cores()) as pool:
-        jobs = partial(examine, board, python)
+        jobs = partial(examine, board, python, frames)
         reports = list(pool.map(jobs, calibrations.keys(), calibrations.values()))
     print_tables(reports)
     if options.json:
@@ -89,7 +89,7 @@ def main() -> int:
                 **software(python),
             },
             "compared_with": software(Path(sys.executable)),
-            "dataset": f"{DATASET}, {FRAMES_PER_FLIGHT} frames of each test flight",
+            "dataset": f"{DATASET}, {per_flight} frames of each test flight",
             "confidence": CONFIDENCE,
             "tests": tests,
             "tolerances": {name: asdict(each) for name, each in TOLERANCES.items()},
@@ -129,7 +129,9 @@ def run_tests(board: Board, python: Path) -> dict[str, int]:
     return {"passed": passed, "skipped": counts["skipped"], "failed": failed}
 
 
-def examine(board: Board, python: Path, folder: Path, calibration: Calibration) -> dict[str, Any]:
+def examine(
+    board: Board, python: Path, frames: Path, folder: Path, calibration: Calibration
+) -> dict[str, Any]:
     """Self-test, records and their comparison, of one bundle -> its figures, with failures."""
     name, precision = calibration.name, calibration.model.precision
     tolerance, banded = TOLERANCES[precision], calibration.method == "csp"
@@ -139,34 +141,38 @@ def examine(board: Board, python: Path, folder: Path, calibration: Calibration) 
     if tested.returncode != 0:
         failures.append(f"verify: {said}")
     print(f"{board.name}: {said}", flush=True)
+    count = len(list(frames.glob("*" + MATRIX_SUFFIX)))
     scopes: dict[str, Any] = {}
-    for scope in FRAMES_OF_SCOPE:
-        here = _records(Path(sys.executable), platform.machine(), folder, calibration, scope)
-        there = _records(python, board.name, folder, calibration, scope)
+    for scope, limit in (("marginal", count), ("joint", max(1, count // JOINT_SHARE))):
+        options = (f"--scope={scope}", f"--max-frames={limit}")
+        here, there = (
+            _records(each, f"{on}-{calibration.name}-{scope}", folder, frames, options)
+            for on, each in ((platform.machine(), Path(sys.executable)), (board.name, python))
+        )
         found = difference(here, there, tolerance)
         failures += [f"{scope}: {line}" for line in exceeded(found, tolerance, banded=banded)]
         scopes[scope] = {
             "difference": asdict(found),
             "coverage": {
-                platform.machine(): _coverage(here, calibration),
-                board.name: _coverage(there, calibration),
+                platform.machine(): _coverage(here, frames, calibration),
+                board.name: _coverage(there, frames, calibration),
             },
         }
     report = {"name": name, "precision": precision, "self_test": said, "scopes": scopes}
     if board.saturates and precision == "int8":
-        control = saturation(python, folder)
+        control = saturation(python, folder, frames)
         report["saturation"] = control
         if not control["without_m"] > control["with_m"]:
             failures.append("control: expected 8-bit products to saturate without the option")
     return {**report, "failures": failures}
 
 
-def saturation(python: Path, folder: Path) -> dict[str, float]:
+def saturation(python: Path, folder: Path, frames: Path) -> dict[str, float]:
     """Largest error of the position with and without onnxruntime's option, against this machine.
 
     A control: where nothing saturates without it, no processor without VNNI was tried.
     """
-    script = (ROOT / "boards" / "saturation.py", folder, FRAMES, str(CONTROL_FRAMES))
+    script = (ROOT / "boards" / "saturation.py", folder, frames, str(CONTROL_FRAMES))
     here, there = (
         {key: np.array(poses) for key, poses in json.loads(_output(each, *script)).items()}
         for each in (Path(sys.executable), python)
@@ -216,23 +222,22 @@ def print_tables(reports: list[dict[str, Any]]) -> None:
 
 
 def _records(
-    python: Path, machine: str, folder: Path, calibration: Calibration, scope: str
+    python: Path, name: str, folder: Path, frames: Path, options: tuple[str, ...]
 ) -> Records:
-    output = FOLDER / f"{machine}-{calibration.name}-{scope}.jsonl"
+    output = FOLDER / f"{name}.jsonl"
     output.unlink(missing_ok=True)
-    limits = (f"--max-frames={FRAMES_OF_SCOPE[scope]}", f"--confidence={CONFIDENCE}")
     # A cache entry is told by /proc/cpuinfo, which an emulated x86 shares with this machine.
-    options = (f"--scope={scope}", "--threads=1", "--no-cache", "--quiet", f"--output={output}")
-    _output(python, *_RUNTIME, "run", folder, FRAMES, *limits, *options)
+    how = (f"--confidence={CONFIDENCE}", "--threads=1", "--no-cache", "--quiet")
+    _output(python, *_RUNTIME, "run", folder, frames, *options, *how, f"--output={output}")
     return read_records(output)
 
 
-def _coverage(records: Records, calibration: Calibration) -> dict[str, Any]:
+def _coverage(records: Records, frames: Path, calibration: Calibration) -> dict[str, Any]:
     reference = calibration.pose.reference_q_xyzw
     chart = Chart(calibration.pose.rotation, None if reference is None else np.array(reference))
     truth = {}
     for source in records.sources:
-        pose = read_pose_matrix(FRAMES / source.replace(".color.jpg", MATRIX_SUFFIX))
+        pose = read_pose_matrix(frames / source.replace(".color.jpg", MATRIX_SUFFIX))
         if pose is not None:
             truth[source] = pose
     return coverage(records, chart, truth)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -94,6 +95,9 @@ def set_up(board: Board) -> Path:
 
     Raises SetUpError where something is missing or fails.
     """
+    if (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        found = f"{platform.system()} on {platform.machine()}"
+        raise SetUpError(f"{board.name}: expected Linux on x86_64 to compare with, found {found}")
     _install_emulator(board)
     folder = FOLDER / board.name
     folder.mkdir(parents=True, exist_ok=True)
