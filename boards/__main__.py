@@ -61,7 +61,9 @@ def main() -> int:
     parser.add_argument(
         "--bundles", nargs="+", type=Path, default=demonstrations(), help="the repository's own"
     )
-    parser.add_argument("--frames-per-flight", type=int, default=5, help="of 20 test flights")
+    parser.add_argument(
+        "--frames-per-flight", type=int, choices=range(1, 51), default=5, metavar="N"
+    )
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
     board, per_flight = BOARDS[options.board], options.frames_per_flight
@@ -82,7 +84,7 @@ def main() -> int:
     print_tables(reports)
     if options.json:
         figures = {
-            "command": f"make {board.name}",
+            "command": f"python -m boards {board.name} --frames-per-flight {per_flight}",
             "emulated": {
                 "processor": f"{board.meaning} ({board.cpu})",
                 "emulator": emulator_version(board),
