@@ -53,6 +53,9 @@ JOINT_SHARE = 5
 CONTROL_FRAMES = 5
 LEAST_SATURATION_M = 1e-3
 
+# Their sets move by whole classes, or by whole leaves of a forest.
+STEPWISE = ("csp", "cqr")
+
 _RUNTIME = ("-c", "from cvo_edge.cli import main; main()")
 
 
@@ -139,7 +142,7 @@ def examine(
 ) -> dict[str, Any]:
     """Self-test, records and their comparison, of one bundle -> its figures, with failures."""
     name, precision = calibration.name, calibration.model.precision
-    tolerance, banded = TOLERANCES[precision], calibration.method == "csp"
+    tolerance, stepwise = TOLERANCES[precision], calibration.method in STEPWISE
     failures = []
     tested = _call(python, *_RUNTIME, "verify", folder, "--threads=1")
     said = (tested.stdout or tested.stderr).strip()
@@ -155,7 +158,7 @@ def examine(
             for on, each in ((platform.machine(), Path(sys.executable)), (board.name, python))
         )
         found = difference(here, there, tolerance)
-        failures += [f"{scope}: {line}" for line in exceeded(found, tolerance, banded=banded)]
+        failures += [f"{scope}: {line}" for line in exceeded(found, tolerance, stepwise=stepwise)]
         scopes[scope] = {
             "difference": asdict(found),
             "coverage": {

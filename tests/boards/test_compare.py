@@ -48,7 +48,7 @@ def test_a_run_does_not_differ_from_itself_whatever_is_in_it():
     found = compared(run, run)
     assert (found.frames, found.statuses, found.bands, found.moved) == (4, 0, 0, 0)
     assert found.position_m == found.rotation_rad == found.bound_m == found.bound_rad == 0.0
-    assert exceeded(found, TOLERANCE, banded=False) == []
+    assert exceeded(found, TOLERANCE, stepwise=False) == []
 
 
 def test_poses_differ_by_distance_and_angle_and_in_units_of_the_mean_width():
@@ -78,7 +78,7 @@ def test_one_bound_that_moves_is_found(end, dof, unit):
     assert found.bound_share == pytest.approx(0.1)
     assert (found.bound_m, found.bound_rad).count(0.0) == 1
     assert found.moved == 1
-    assert exceeded(found, TOLERANCE, banded=False) != []
+    assert exceeded(found, TOLERANCE, stepwise=False) != []
 
 
 def test_a_bound_on_one_side_only_is_infinitely_far():
@@ -86,14 +86,15 @@ def test_a_bound_on_one_side_only_is_infinitely_far():
     other["interval"]["upper"][0] = None
     found = compared([record()], [other])
     assert math.isinf(found.bound_m)
-    assert exceeded(found, TOLERANCE, banded=False) != []
+    assert exceeded(found, TOLERANCE, stepwise=False) != []
+    assert exceeded(found, Tolerance(share=0.05, moved_share=1.0), stepwise=True) != []
 
 
 def test_a_status_of_its_own_is_too_much():
     found = compared([record(0), record(1)], [record(0), invalid(1)])
     assert found.statuses == 1
     assert math.isinf(found.position_m)
-    assert any(line.startswith("status:") for line in exceeded(found, TOLERANCE, banded=True))
+    assert any(line.startswith("status:") for line in exceeded(found, TOLERANCE, stepwise=True))
 
 
 def test_few_sets_with_bands_may_change_as_a_class_enters_or_leaves():
@@ -101,9 +102,9 @@ def test_few_sets_with_bands_may_change_as_a_class_enters_or_leaves():
     first = [record(number, bands=whole) for number in range(2)]
     once, both = [record(0, bands=split), first[1]], [record(n, bands=split) for n in range(2)]
     assert compared(first, once).bands == 1
-    assert exceeded(compared(first, once), TOLERANCE, banded=True) == []
+    assert exceeded(compared(first, once), TOLERANCE, stepwise=True) == []
     assert compared(first, both).moved == 2
-    assert exceeded(compared(first, both), TOLERANCE, banded=True) != []
+    assert exceeded(compared(first, both), TOLERANCE, stepwise=True) != []
 
 
 def test_a_gap_is_no_width():
