@@ -151,8 +151,8 @@ def _install_emulator(board: Board) -> None:
         return
     if not shutil.which("apt-get") or os.geteuid() != 0:
         raise SetUpError(
-            f"{board.emulator}: not found, and only root on a machine with apt-get can be given "
-            "it; install the package qemu-user-static"
+            f"{board.emulator}: not found; install the package qemu-user-static, or run this as "
+            "root where there is apt-get"
         )
     _call("apt-get", "-qq", "update")
     _call("apt-get", "-qq", "-y", "--no-install-recommends", "install", "qemu-user-static")
