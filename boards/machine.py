@@ -114,7 +114,9 @@ def set_up(board: Board) -> Path:
         emulator = f"{board.emulator} -cpu {board.cpu}"
         wheels = []
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    (folder / "pyvenv.cfg").write_text(f"home = {interpreter.parent}\n", "utf-8")
+    # Or what this machine's Python has installed would be found, too.
+    alone = "include-system-site-packages = false"
+    (folder / "pyvenv.cfg").write_text(f"home = {interpreter.parent}\n{alone}\n", "utf-8")
     python = folder / "bin" / "python"
     python.parent.mkdir(exist_ok=True)
     python.write_text(f'#!/bin/sh\nexec {emulator} -0 "$0" "{interpreter}" "$@"\n', "utf-8")
