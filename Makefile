@@ -8,16 +8,18 @@ METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 CLIP := calibration_artifacts/synthetic-room-clip
 
-.PHONY: help demo test check format clean bench soak
+.PHONY: help demo test check bench soak arm64 avx2 format clean
 
 help:
 	@echo "make demo    install the runtime alone and run the demonstration bundles on a sample clip"
 	@echo "make test    install both packages and run the test-suite (CVO_DATA: real data, optional)"
+	@echo "make arm64   test the runtime on an emulated 64-bit ARM, and compare its numbers with this machine's"
+	@echo "make avx2    the same on an x86-64 without VNNI (both: Linux with apt-get, as root for the emulator)"
 	@echo "make check   lint, formatting, types and import rules"
 	@echo "make bench   compare speed, memory and start side by side; half an hour on a quiet machine"
 	@echo "make soak    a million frames: does memory grow? half an hour"
 	@echo "make format  reformat the code"
-	@echo "make clean   remove both virtual environments"
+	@echo "make clean   remove the virtual environments and emulated boards"
 
 $(DEMO_VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(DEMO_VENV)
@@ -42,6 +44,9 @@ demo-%: $(DEMO_VENV)/.installed
 
 test: $(VENV)/.installed
 	$(VENV)/bin/python -m pytest
+
+arm64 avx2: $(VENV)/.installed
+	$(VENV)/bin/python -m boards $@ --json bench/results/boards/$@.json
 
 check: $(VENV)/.installed
 	$(VENV)/bin/ruff check .
@@ -68,4 +73,4 @@ format: $(VENV)/.installed
 	$(VENV)/bin/ruff format .
 
 clean:
-	rm -rf $(VENV) $(DEMO_VENV) $(addprefix demo-,$(METHODS:=.jsonl))
+	rm -rf $(VENV) $(DEMO_VENV) .boards $(addprefix demo-,$(METHODS:=.jsonl))

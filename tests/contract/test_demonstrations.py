@@ -48,6 +48,7 @@ def test_it_is_small_enough_for_a_repository(demonstration):
     assert (demonstration / "calibration.json").stat().st_size <= 64 * 1024
 
 
+@pytest.mark.whole_clip
 @pytest.mark.parametrize("scope", ["marginal", "joint"])
 def test_the_clip_is_covered_about_as_often_as_stated(demonstration, clip_dir, scope):
     # A new flight of the scene that was trained on: far from exact theory, near the number.
@@ -59,6 +60,7 @@ def test_the_clip_is_covered_about_as_often_as_stated(demonstration, clip_dir, s
     assert covered.mean() > 0.75
 
 
+@pytest.mark.whole_clip
 def test_every_record_is_json_and_bands_are_ordered_and_disjoint(demonstration, clip_dir):
     with Odometer.load(demonstration) as odometer:
         for estimate in odometer.stream(open_source(str(clip_dir))):

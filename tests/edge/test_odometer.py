@@ -54,6 +54,7 @@ def test_joint_sets_hold_the_marginal_ones(bundle_dir, frames):
     assert (outer.upper - outer.lower >= inner.upper - inner.lower).all()
 
 
+@pytest.mark.whole_clip
 def test_clip_is_covered_about_as_often_as_stated(bundle_dir, clip_dir, frames):
     # A new flight of the scene that was trained on: far from exact theory, near the number.
     truth = open_ground_truth(clip_dir)

@@ -1,0 +1,1 @@
+"""The runtime on other processors: emulated boards, and a comparison with this machine."""

@@ -1,0 +1,247 @@
+"""Emulated boards: a Python of another processor, with the runtime alone, under qemu-user.
+
+Each is a virtual environment in a folder of its own; its ``bin/python`` starts the emulator. Python
+takes that script for its own executable, so that child processes are emulated, too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDER = ROOT / ".boards"
+
+# What tests/edge and pytest's settings in pyproject.toml need; the others are oracles.
+TEST_PACKAGES = ("pytest", "hypothesis", "pytest-timeout", "pytest-xdist")
+
+# The Python of Debian 12, and the newest C library that wheels for it may ask for.
+_DEBIAN_PYTHON = "3.11"
+_GLIBC_MINOR = 36
+
+_PROCESSOR = """\
+processor\t: {number}
+BogoMIPS\t: 108.00
+Features\t: {features}
+CPU implementer\t: 0x41
+CPU architecture: 8
+CPU variant\t: 0x{variant:x}
+CPU part\t: 0x{part:x}
+CPU revision\t: {revision}
+
+"""
+
+
+class SetUpError(Exception):
+    """Something that a board needs is missing or failed, in one line."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A processor to emulate.
+
+    Attributes
+    ----------
+    name, meaning
+        For a command line and for a person.
+    emulator, cpu
+        qemu's program, and its name of the processor.
+    saturates
+        Whether 8-bit products saturate there, unless onnxruntime is told otherwise.
+    """
+
+    name: str
+    meaning: str
+    emulator: str
+    cpu: str
+    saturates: bool
+
+
+BOARDS = {
+    board.name: board
+    for board in (
+        Board(
+            "arm64",
+            "64-bit ARM, as in a Raspberry Pi 4",
+            "qemu-aarch64-static",
+            "cortex-a72",
+            saturates=False,
+        ),
+        Board(
+            "avx2",
+            "x86-64 with AVX2, without AVX-512 and VNNI",
+            "qemu-x86_64-static",
+            # Without the features that the emulator would say on stderr it has not.
+            "Haswell-noTSX,-pcid,-x2apic,-tsc-deadline,-invpcid",
+            saturates=True,
+        ),
+    )
+}
+
+
+def set_up(board: Board) -> Path:
+    """Make the board's Python in ``.boards/<name>/`` -> its path; what is there already is kept.
+
+    Raises SetUpError where something is missing or fails.
+    """
+    if (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        found = f"{platform.system()} on {platform.machine()}"
+        raise SetUpError(f"{board.name}: expected Linux on x86_64 to compare with, found {found}")
+    _install_emulator(board)
+    folder = FOLDER / board.name
+    folder.mkdir(parents=True, exist_ok=True)
+    if board.name == "arm64":
+        root = folder / "root"
+        if not root.is_dir():
+            _extract_debian(folder, root)
+        interpreter = root / "usr" / "bin" / f"python{_DEBIAN_PYTHON}"
+        emulator = f'{board.emulator} -cpu {board.cpu} -L "{root}"'
+        wheels = _arm_wheel_options()
+        version = _DEBIAN_PYTHON
+    else:
+        interpreter = Path(sys.executable).resolve()
+        emulator = f"{board.emulator} -cpu {board.cpu}"
+        wheels = []
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    # Or what this machine's Python has installed would be found, too.
+    alone = "include-system-site-packages = false"
+    (folder / "pyvenv.cfg").write_text(f"home = {interpreter.parent}\n{alone}\n", "utf-8")
+    python = folder / "bin" / "python"
+    python.parent.mkdir(exist_ok=True)
+    python.write_text(f'#!/bin/sh\nexec {emulator} -0 "$0" "{interpreter}" "$@"\n', "utf-8")
+    python.chmod(0o755)
+    _install_packages(folder, folder / "lib" / f"python{version}" / "site-packages", wheels)
+    return python
+
+
+def emulator_version(board: Board) -> str:
+    """Name and version of the emulator, as it says."""
+    done = subprocess.run([board.emulator, "--version"], capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()[0]
+
+
+def requirements(project: Mapping[str, Any]) -> list[str]:
+    """Requirements of the runtime and its tests, as ``pyproject.toml`` (parsed) states them.
+
+    Raises SetUpError where it has none for one of ``TEST_PACKAGES``.
+    """
+    table = project["project"]
+    tests = {_package(line): line for line in table["optional-dependencies"]["test"]}
+    missing = [name for name in TEST_PACKAGES if name not in tests]
+    if missing:
+        raise SetUpError(f"pyproject.toml: expected {', '.join(missing)} in the extra test")
+    return [*table["dependencies"], *(tests[name] for name in TEST_PACKAGES)]
+
+
+def _package(requirement: str) -> str:
+    return re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0].lower()
+
+
+def _install_emulator(board: Board) -> None:
+    if shutil.which(board.emulator):
+        return
+    if not shutil.which("apt-get") or os.geteuid() != 0:
+        raise SetUpError(
+            f"{board.emulator}: not found; install the package qemu-user-static, or run this as "
+            "root where there is apt-get"
+        )
+    _call("apt-get", "-qq", "update")
+    _call("apt-get", "-qq", "-y", "--no-install-recommends", "install", "qemu-user-static")
+
+
+def _extract_debian(folder: Path, root: Path) -> None:
+    """Fill ``root`` with Debian's Python for ARM: packages are unpacked, none is installed."""
+    for program in ("apt-get", "dpkg-deb"):
+        if not shutil.which(program):
+            raise SetUpError(f"{program}: not found; the ARM Python comes from Debian packages")
+    work, partial = folder / "packages", folder / "root.partial"
+    for old in (work, partial):
+        shutil.rmtree(old, ignore_errors=True)
+    (work / "lists" / "partial").mkdir(parents=True)
+    (work / "cache" / "archives" / "partial").mkdir(parents=True)
+    (work / "status").touch()
+    # Lists and a status of its own: nothing is known to be installed, and this machine's are kept.
+    settings = {
+        "APT::Architecture": "arm64",
+        "APT::Architectures": "arm64",
+        "APT::Sandbox::User": "root",
+        "Dir::State": work,
+        "Dir::State::status": work / "status",
+        "Dir::Cache": work / "cache",
+        "Dir::Etc::preferences": "/dev/null",
+        "Dir::Etc::preferencesparts": "/dev/null",
+    }
+    apt = ["apt-get", "-qq", *(f"--option={key}={value}" for key, value in settings.items())]
+    _call(*apt, "update")
+    download = ["--yes", "--no-install-recommends", "--download-only", "install"]
+    _call(*apt, *download, f"python{_DEBIAN_PYTHON}", "libstdc++6")
+    for package in sorted((work / "cache" / "archives").glob("*.deb")):
+        _call("dpkg-deb", "--extract", str(package), str(partial))
+    # onnxruntime reads it when it is imported, and crashes on an x86 one.
+    (partial / "proc").mkdir()
+    (partial / "proc" / "cpuinfo").write_text(_arm_cpuinfo(os.cpu_count() or 1), "ascii")
+    shutil.rmtree(work)
+    partial.rename(root)
+
+
+def _arm_cpuinfo(cores: int) -> str:
+    """``/proc/cpuinfo`` of a Cortex-A72, revision r0p3, with the features that qemu gives it."""
+    features = "fp asimd evtstrm aes pmull sha1 sha2 crc32 cpuid"
+    return "".join(
+        _PROCESSOR.format(number=number, features=features, variant=0, part=0xD08, revision=3)
+        for number in range(cores)
+    )
+
+
+def _arm_wheel_options() -> list[str]:
+    """Options by which pip takes wheels for ARM and Debian's Python."""
+    platforms = [f"manylinux_2_{minor}_aarch64" for minor in range(_GLIBC_MINOR, 16, -1)]
+    tag = "cp" + _DEBIAN_PYTHON.replace(".", "")
+    return [
+        "--only-binary=:all:",
+        "--implementation=cp",
+        f"--python-version={_DEBIAN_PYTHON}",
+        *(f"--abi={abi}" for abi in (tag, "abi3", "none")),
+        *(f"--platform={name}" for name in (*platforms, "manylinux2014_aarch64")),
+    ]
+
+
+def _install_packages(folder: Path, site: Path, wheels: list[str]) -> None:
+    """Install what the runtime and its tests need, in the releases that this Python has.
+
+    Others would compute other numbers on the same processor.
+    """
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    wanted = "\n".join(requirements(project)) + "\n"
+    found = {_package(item.name): item.version for item in distributions()}
+    same = "".join(f"{name}=={version}\n" for name, version in sorted(found.items()))
+    stamp = folder / "installed"
+    state = hashlib.sha256("\n".join([wanted, same, *wheels]).encode()).hexdigest()
+    if stamp.is_file() and stamp.read_text("ascii") == state:
+        return
+    shutil.rmtree(site, ignore_errors=True)
+    (folder / "requirements.txt").write_text(wanted, "utf-8")
+    (folder / "constraints.txt").write_text(same, "utf-8")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-compile", f"--target={site}"]
+    files = (f"{folder}/requirements.txt", f"--constraint={folder}/constraints.txt")
+    _call(*pip, *wheels, "--requirement", *files)
+    stamp.write_text(state, "ascii")
+
+
+def _call(*command: str) -> None:
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    if done.returncode != 0:
+        said = (done.stderr.strip() or done.stdout.strip() or "nothing was said").splitlines()
+        raise SetUpError(f"{Path(command[0]).name}: failed with {done.returncode}: {said[-1]}")
