@@ -135,13 +135,14 @@ def _draft(
     """Everything but score, thresholds and self-test."""
     config, target = run.config, run.target
     roles = run.split.roles
+    model = model_spec(model_bytes, OPSET)
     # Of all frames of these roles, also where a run was given a share: the unit of its score.
     known = target.coordinates(run.dataset.poses[np.concatenate([roles["train"], roles["fit"]])])
     return Calibration(
         schema_version=1,
         name=name,
         method=run.graph.head.runtime_method,
-        model=model_spec(model_bytes, OPSET),
+        model=model,
         preprocess=artifact.PreprocessSpec(
             height=config.height,
             width=config.width,
@@ -175,7 +176,7 @@ def _draft(
             split=run.split.spec(run.dataset),
             dataset=run.dataset.name,
         ),
-        selftest=blank_selftest(),
+        selftest=blank_selftest(model.precision),
         provenance=artifact.Provenance(
             created_with=versions(
                 ("cvo-edge", "cvo-export", "torch", "timm", "onnx", "onnxruntime", "numpy")

@@ -238,7 +238,7 @@ def _from_model(
             split=split.spec(dataset),
             dataset=dataset.name,
         ),
-        selftest=blank_selftest(),
+        selftest=blank_selftest(spec.precision),
         provenance=artifact.Provenance(
             created_with=versions(("cvo-edge", "cvo-export", "onnx", "onnxruntime", "numpy")),
             seed=split.seed,

@@ -1,4 +1,4 @@
-"""How many cores there are: what the affinity and every control group above allow."""
+"""How many cores there are, and whether they can multiply 8-bit numbers."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import math
 import os
 from pathlib import Path
 
+import numpy as np
+import onnxruntime
 import pytest
 
+from cvo_edge import session
 from cvo_edge.session import allowed_cores, cgroup_cores
 
 
@@ -55,3 +58,16 @@ def test_cores_are_those_of_affinity_and_quota(monkeypatch, quota, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5})
     monkeypatch.setattr("cvo_edge.session.cgroup_cores", lambda: quota)
     assert allowed_cores() == expected
+
+
+def test_sums_of_8_bit_products_are_exact_as_a_session_is_set_up():
+    """On x86 without VNNI they are only because the session is told to be precise."""
+    options = onnxruntime.SessionOptions()
+    precise = str(int(session.saturates()))
+    options.add_session_config_entry("session.x64quantprecision", precise)
+    engine = onnxruntime.InferenceSession(
+        session._PRODUCT, options, providers=["CPUExecutionProvider"]
+    )
+    for value in (0, 1, 255):
+        (found,) = engine.run(None, {"a": np.full((1, 32), value, np.uint8)})
+        assert found.tolist() == [[32 * value * 127]]

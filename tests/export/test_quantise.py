@@ -6,8 +6,10 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
+from cvo_edge import session
 from cvo_edge.artifact import read_bundle
 from cvo_edge.conformal import conformal_quantile
 from cvo_edge.odometer import Odometer
@@ -110,3 +112,17 @@ def test_an_eight_bit_bundle_is_calibrated_as_such(head, tmp_path, tiny_run):
         stored = calibration.threshold(0.9, "marginal").q_hat
         assert list(stored) == [conformal_quantile(scores[:, 0, dof], 0.9) for dof in range(6)]
     assert stored != plain.calibration.threshold(0.9, "marginal").q_hat
+
+
+def test_the_runtimes_question_to_the_processor_is_this_product():
+    ones = numpy_helper.from_array(np.full((32, 1), 127, np.int8), "b")
+    graph = helper.make_graph(
+        [helper.make_node("MatMulInteger", ["a", "b"], ["y"])],
+        "g",
+        [helper.make_tensor_value_info("a", TensorProto.UINT8, [1, 32])],
+        [helper.make_tensor_value_info("y", TensorProto.INT32, [1, 1])],
+        [ones],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
+    model.ClearField("producer_name")
+    assert onnx.load_from_string(session._PRODUCT) == model
