@@ -42,7 +42,11 @@ THREADS, ROUNDS, WARM_UP = 2, 150, 20
 
 
 class Timed:
-    """The calls on one bundle; ``conformal_ms`` is what follows the network in each ``step``."""
+    """The calls on one bundle; ``conformal_ms`` is what follows the network in each ``step``.
+
+    An array is one that has just been written, as a camera or a decoder leaves it; so is the input
+    of the bare call.
+    """
 
     def __init__(self, bundle: Bundle, sink: Sink, scope: Scope = "marginal") -> None:
         self.conformal_ms: list[float] = []
@@ -50,23 +54,45 @@ class Timed:
         self._odometer = Odometer(bundle, threads=THREADS, scope=scope)
         self._alone = Session(pose_alone(bundle.model_bytes), THREADS)
         self._sink = sink
-        self._images, self._files = images(), frames()
-        extra = self._odometer.head.extra_inputs(0)
-        self._ready = [{"image": self._input(image), **extra} for image in self._images]
+        self._pictures, self._files = images(), frames()
+        self._image = np.empty_like(self._pictures[0])
+        self._feeds = dict(self._odometer.head.extra_inputs(0))
 
-    def calls(self, prefix: str) -> dict[str, Callable[[int], object]]:
+    def calls(self) -> dict[str, Callable[[int], object]]:
         """Return the calls by name."""
-        names = ("raw", "step", "record", "pose_alone")
-        return {f"{prefix}.{name}": getattr(self, name) for name in names}
+        return {
+            "raw": self.raw,
+            "step": self.step,
+            "record": self.record,
+            "pose_alone": self.pose_alone,
+        }
 
-    def raw(self, number: int) -> None:
+    def before(self) -> dict[str, Callable[[int], object]]:
+        """Return what comes before each, untimed."""
+        return {
+            "raw": self.write_input,
+            "step": self.write_image,
+            "record": lambda _: None,
+            "pose_alone": self.write_image,
+        }
+
+    def write_image(self, number: int) -> None:
+        """Write the next picture."""
+        np.copyto(self._image, self._pictures[number % len(self._pictures)])
+
+    def write_input(self, number: int) -> None:
+        """Write the network's input for the next picture."""
+        self.write_image(number)
+        self._feeds["image"] = self._input()
+
+    def raw(self, _: int) -> None:
         """Run the bare call."""
         if self._odometer.session:
-            self._odometer.session.engine.run(None, self._ready[number % len(self._ready)])
+            self._odometer.session.engine.run(None, self._feeds)
 
     def step(self, number: int) -> None:
         """From an array to intervals."""
-        estimate = self._odometer.step(self._images[number % len(self._images)])
+        estimate = self._odometer.step(self._image)
         if not estimate.bounded:
             raise SystemExit(f"frame {number}: expected finite intervals, found none")
         self.conformal_ms.append(estimate.latency_ms["conformal"])
@@ -77,12 +103,12 @@ class Timed:
         image = decode_image(path.read_bytes())
         self._sink.write(self._odometer.step(image, source=path.name))
 
-    def pose_alone(self, number: int) -> None:
+    def pose_alone(self, _: int) -> None:
         """From an array to the pose, without what only intervals need."""
-        self._alone.run({"image": self._input(self._images[number % len(self._images)])})
+        self._alone.run({"image": self._input()})
 
-    def _input(self, image: object) -> preprocess.Image:
-        bgr = preprocess.to_bgr8(image)
+    def _input(self) -> preprocess.Image:
+        bgr = preprocess.to_bgr8(self._image)
         if bgr is None:
             raise SystemExit("expected images, found none")
         return preprocess.model_input(bgr, self._spec.height, self._spec.width, self._spec.crop)
@@ -93,10 +119,15 @@ def measured(folders: dict[str, Path], rounds: int, scope: Scope = "marginal") -
     with ExitStack() as stack:
         sink = stack.enter_context(Sink(str(WORK / "records.jsonl"), "jsonl"))
         timed = {name: Timed(read_bundle(folder), sink, scope) for name, folder in folders.items()}
-        calls: dict[str, Callable[[int], object]] = {}
-        for name, one in timed.items():
-            calls |= one.calls(name)
-        spent = interleaved(calls, rounds=rounds, warmup=WARM_UP)
+        calls, before = (
+            {
+                f"{name}.{kind}": call
+                for name, one in timed.items()
+                for kind, call in of(one).items()
+            }
+            for of in (Timed.calls, Timed.before)
+        )
+        spent = interleaved(calls, rounds=rounds, warmup=WARM_UP, before=before)
     found: dict[str, Any] = {}
     for name, one in timed.items():
         ms = {kind: spent[f"{name}.{kind}"] for kind in ("raw", "step", "record", "pose_alone")}

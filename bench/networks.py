@@ -32,7 +32,7 @@ PRECISIONS = ("fp32", "int8")
 ROOM = "synthetic:room,flights=20,frames=20"
 FRAMES = "synthetic:room,flights=1,frames=50,size=640x480,seed=1"
 _WHOLE = "--stages final --grid 1x1 --size 224x224 --crop centre"
-_UNTRAINED = "--steps 100 --copies 0"
+_UNTRAINED = "--split random --steps 100 --copies 0"
 
 
 def whole_bundle(method: str, backbone: str, precision: str = "fp32") -> Path:

@@ -11,9 +11,12 @@ turns. Camera: frames that come 30 times a second, processor time a frame of onn
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -33,6 +36,8 @@ from cvo_edge.sources import Frame, open_source
 METHOD, THREADS = "cjp", 2
 ROUNDS, WARM_UP = 15, 2
 FPS, SECONDS, CAMERA_ROUNDS = 30, 3, 5
+STEPS = 200
+BUSY = "while True: pass"
 
 
 def as_it_comes(bundle: Path, threads: int) -> onnxruntime.InferenceSession:
@@ -141,11 +146,40 @@ def camera(backbone: str) -> dict[str, Any]:
     }
 
 
+def neighbour(backbone: str) -> dict[str, Any]:
+    """Milliseconds of a step where nothing else runs, and beside one process that never rests."""
+    found: dict[str, Any] = {}
+    content = read_bundle(whole_bundle(METHOD, backbone))
+    pictures = images()
+    for name in ("alone", "beside one"):
+        with ExitStack() as stack:
+            if name != "alone":
+                busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", BUSY]))
+                stack.callback(busy.kill)
+            calls: dict[str, Callable[[int], object]] = {}
+            for mode in (Mode.LATENCY, Mode.LIVE):
+                for threads in (THREADS, 1):
+                    odometer = Odometer(content, threads=threads, mode=mode)
+                    stack.enter_context(odometer)
+                    calls[f"{mode}, {threads}"] = partial(_step, odometer, pictures)
+            spent = interleaved(calls, rounds=STEPS, warmup=20)
+        found[name] = {call: figures(values) for call, values in spent.items()}
+    return found
+
+
+def _step(odometer: Odometer, pictures: list[np.ndarray], number: int) -> None:
+    odometer.step(pictures[number % len(pictures)])
+
+
 def main() -> None:
-    """Measure both for both backbones."""
+    """Measure all for both backbones."""
     results: dict[str, Any] = {}
     for backbone in BACKBONES:
-        results[backbone] = {"throughput": throughput(backbone), "camera": camera(backbone)}
+        results[backbone] = {
+            "throughput": throughput(backbone),
+            "camera": camera(backbone),
+            "neighbour": neighbour(backbone),
+        }
         for name, row in results[backbone]["throughput"].items():
             print(
                 f"{backbone:<16} {name:<17} {row['ms_per_frame']['median']:7.2f} ms a frame, "
@@ -158,6 +192,9 @@ def main() -> None:
                 f"frame at {FPS}, {row['over_onnxruntime']['median']:.3f} of onnxruntime's",
                 flush=True,
             )
+        for name, rows in results[backbone]["neighbour"].items():
+            line = ", ".join(f"{call}: {row['median']:.2f}" for call, row in rows.items())
+            print(f"{backbone:<16} {name:<17} ms a step, mode and threads: {line}", flush=True)
     write_report(
         "stream", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP, fps=FPS, method=METHOD
     )

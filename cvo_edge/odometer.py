@@ -36,6 +36,8 @@ from cvo_edge.sources import Frame, Newest, Source
 Array = NDArray[np.float64]
 
 _STEEP_PITCH = np.deg2rad(80.0)
+# Numbers that Python looks at in less time than numpy's first call takes.
+_FEW = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +122,7 @@ class Odometer:
         self._limits_chart = self.chart
         if reference is not None and calibration.pose.rotation == "tangent_predicted":
             self._limits_chart = Chart("tangent_reference", np.array(reference))
-        self._lowest = np.array(calibration.pose.limits.lowest)
-        self._highest = np.array(calibration.pose.limits.highest)
+        self._limits = calibration.pose.limits
         self._seq = 0
 
     @classmethod
@@ -263,25 +264,35 @@ class Odometer:
         ready = perf_counter()
         outputs = self.session.run({"image": tensor, **self.head.extra_inputs(seq)})
         done = perf_counter()
-        pose = outputs["pose"][0].astype(np.float64)
-        fault: Reason | None = None
-        point = pose[:6]
-        if not all(np.isfinite(output).all() for output in outputs.values()):
-            fault = Reason.OUTPUT_NOT_FINITE
-        else:
-            length = math.hypot(*pose[3:].tolist())
-            if length > 0.0:
-                # Unit, and of the two quaternions of a rotation the one with qw >= 0.
-                pose[3:] /= math.copysign(length, pose[6])
-            else:
-                pose[3:] = math.nan
-            point = plausible = self.chart.point(pose)
-            if self._limits_chart is not self.chart:
-                plausible = self._limits_chart.point(pose)
-            # Written so that NaN (a zero quaternion) fails the check.
-            if not ((self._lowest <= plausible) & (plausible <= self._highest)).all():
-                fault = Reason.POSE_IMPLAUSIBLE
+        pose, point, fault = self._checked(outputs)
         return Observation(outputs, pose, point, fault, 1e3 * (ready - start), 1e3 * (done - ready))
+
+    def _checked(
+        self, outputs: dict[str, NDArray[np.float32]]
+    ) -> tuple[Array, Array, Reason | None]:
+        """Outputs -> unit pose (7,) and point (6,), and what is wrong with them.
+
+        A network has just driven all else out of the processor's caches: few numbers are better
+        looked at one by one than by many of numpy's functions.
+        """
+        values = outputs["pose"][0].tolist()
+        if not all(map(_all_finite, outputs.values())):
+            return np.array(values), np.array(values[:6]), Reason.OUTPUT_NOT_FINITE
+        length = math.hypot(*values[3:])
+        # Unit, and of the two quaternions of a rotation the one with qw >= 0.
+        scale = math.copysign(length, values[6]) if length > 0.0 else math.nan
+        pose = np.array([*values[:3], *(value / scale for value in values[3:])])
+        point = plausible = self.chart.point(pose)
+        if self._limits_chart is not self.chart:
+            plausible = self._limits_chart.point(pose)
+        # Written so that NaN (a zero quaternion) fails the check.
+        inside = all(
+            lowest <= value <= highest
+            for lowest, value, highest in zip(
+                self._limits.lowest, plausible.tolist(), self._limits.highest, strict=True
+            )
+        )
+        return pose, point, None if inside else Reason.POSE_IMPLAUSIBLE
 
     @property
     def has_region(self) -> bool:
@@ -324,6 +335,12 @@ def _check_tensors(calibration: Calibration, head: Head) -> None:
             raise BundleMismatchError(
                 f"model.{kind}: expected {needed} for method {calibration.method}, found {found}"
             )
+
+
+def _all_finite(output: NDArray[np.float32]) -> bool:
+    if output.size <= _FEW:
+        return all(map(math.isfinite, output.ravel().tolist()))
+    return bool(np.isfinite(output).all())
 
 
 def _as_frame(frame: Frame | NDArray[Any]) -> Frame:
