@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -114,44 +113,40 @@ class Timed:
         return preprocess.model_input(bgr, self._spec.height, self._spec.width, self._spec.crop)
 
 
-def measured(folders: dict[str, Path], rounds: int, scope: Scope = "marginal") -> dict[str, Any]:
-    """Time one method's bundles by precision, all in turns."""
-    with ExitStack() as stack:
-        sink = stack.enter_context(Sink(str(WORK / "records.jsonl"), "jsonl"))
-        timed = {name: Timed(read_bundle(folder), sink, scope) for name, folder in folders.items()}
-        calls, before = (
-            {
-                f"{name}.{kind}": call
-                for name, one in timed.items()
-                for kind, call in of(one).items()
-            }
-            for of in (Timed.calls, Timed.before)
+def measured(folder: Path, rounds: int, scope: Scope = "marginal") -> dict[str, Any]:
+    """Time one bundle: all four calls in turns."""
+    with Sink(str(WORK / "records.jsonl"), "jsonl") as sink:
+        timed = Timed(read_bundle(folder), sink, scope)
+        ms = interleaved(timed.calls(), rounds=rounds, warmup=WARM_UP, before=timed.before())
+    more_ms = ms["step"] - ms["pose_alone"]
+    return {
+        "ms": {kind: figures(values) for kind, values in ms.items()},
+        "step_over_raw": ratio(ms["step"], ms["raw"]),
+        "step_minus_raw_ms": figures(ms["step"] - ms["raw"]),
+        "record_over_raw": ratio(ms["record"], ms["raw"]),
+        "uncertainty_ms": figures(more_ms),
+        "cost_of_uncertainty": round(float(np.median(more_ms) / np.median(ms["pose_alone"])), 4),
+        "after_network_ms": figures(np.array(timed.conformal_ms[WARM_UP:])),
+    }
+
+
+def precisions(folders: dict[str, Path], rounds: int) -> dict[str, Any]:
+    """Return how the bare calls of float32 and 8 bits compare, in turns."""
+    with Sink(str(WORK / "records.jsonl"), "jsonl") as sink:
+        timed = {name: Timed(read_bundle(folder), sink) for name, folder in folders.items()}
+        ms = interleaved(
+            {name: one.raw for name, one in timed.items()},
+            rounds=rounds,
+            warmup=WARM_UP,
+            before={name: one.write_input for name, one in timed.items()},
         )
-        spent = interleaved(calls, rounds=rounds, warmup=WARM_UP, before=before)
-    found: dict[str, Any] = {}
-    for name, one in timed.items():
-        ms = {kind: spent[f"{name}.{kind}"] for kind in ("raw", "step", "record", "pose_alone")}
-        alone = ms["pose_alone"]
-        more_ms = ms["step"] - alone
-        found[name] = {
-            "ms": {kind: figures(values) for kind, values in ms.items()},
-            "step_over_raw": ratio(ms["step"], ms["raw"]),
-            "step_minus_raw_ms": figures(ms["step"] - ms["raw"]),
-            "record_over_raw": ratio(ms["record"], ms["raw"]),
-            "uncertainty_ms": figures(more_ms),
-            "cost_of_uncertainty": round(float(np.median(more_ms) / np.median(alone)), 4),
-            "after_network_ms": figures(np.array(one.conformal_ms)),
-        }
-    if "int8" in found:
-        found["fp32_over_int8"] = ratio(spent["fp32.raw"], spent["int8.raw"])
-    return found
+    return ratio(ms["fp32"], ms["int8"])
 
 
-def line(precision: str, found: dict[str, Any]) -> str:
-    """Return one precision's figures as text."""
-    row = found[precision]
+def line(row: dict[str, Any]) -> str:
+    """Return one bundle's figures as text."""
     return (
-        f"{precision}: raw {row['ms']['raw']['median']:7.3f} ms, step / raw "
+        f"raw {row['ms']['raw']['median']:7.3f} ms, step / raw "
         f"{row['step_over_raw']['median']:.3f} (+{row['step_minus_raw_ms']['median']:.3f} ms), "
         f"record / raw {row['record_over_raw']['median']:.3f}, uncertainty "
         f"{row['cost_of_uncertainty']:.3f}, after the network "
@@ -172,11 +167,15 @@ def main() -> None:
                 else whole_bundle(method, backbone, precision)
                 for precision in PRECISIONS
             }
-            found = measured(folders, ROUNDS)
-            results[backbone][method] = found
-            for precision in PRECISIONS:
-                print(f"{backbone:<16} {method:<5} {line(precision, found)}", flush=True)
+            found: dict[str, Any] = {}
+            for precision, folder in folders.items():
+                found[precision] = measured(folder, ROUNDS)
+                print(
+                    f"{backbone:<16} {method:<5} {precision} {line(found[precision])}", flush=True
+                )
+            found["fp32_over_int8"] = precisions(folders, ROUNDS)
             print(f"{'':<22} fp32 / int8 {found['fp32_over_int8']['median']:.2f}", flush=True)
+            results[backbone][method] = found
     write_report("frame", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP)
 
 

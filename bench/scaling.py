@@ -65,7 +65,7 @@ def bundle(method: str, size: str = "256x192", **head: int) -> Path:
 
 def one(folder: Path, scope: Scope = "marginal") -> dict[str, Any]:
     """Time one bundle as ``bench/frame.py`` does."""
-    found: dict[str, Any] = measured({"fp32": folder}, ROUNDS, scope)["fp32"]
+    found: dict[str, Any] = measured(folder, ROUNDS, scope)
     outputs = {spec.name: list(spec.shape) for spec in read_calibration(folder).model.outputs}
     return {"outputs": outputs, **found}
 
