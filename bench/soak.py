@@ -66,7 +66,7 @@ def main() -> None:
 
         def write(estimate: PoseInterval) -> None:
             sink.write(estimate)
-            if (estimate.seq + 1) % (count // READINGS) == 0:
+            if (estimate.seq + 1) % max(1, count // READINGS) == 0:
                 open_files = len(list(Path("/proc/self/fd").iterdir()))
                 threads = threading.active_count()
                 readings.append({**memory_mib(), "descriptors": open_files, "threads": threads})
@@ -74,7 +74,7 @@ def main() -> None:
 
         truth = open_ground_truth(CLIP)
         run(odometer, Cycled(count), write, summary=summary, truth=truth)
-    tenth = len(readings) // 10
+    tenth = max(1, len(readings) // 10)
 
     def growth(key: str) -> float:
         values = [row[key] for row in readings]

@@ -17,7 +17,7 @@ import numpy as np
 
 from cvo_edge import preprocess
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.modes import Mode
+from cvo_edge.modes import AHEAD, Mode
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import PoseInterval, Scope
 from cvo_edge.prepared import ModelCache
@@ -158,15 +158,15 @@ def _streams(
     """A part of the frames as a stream, as many bare calls, and so on."""
     found = _Found()
     feeds = _blank_feeds(odometer)
-    if warmup:
-        with closing(odometer.stream(stream)) as estimates:
-            for _ in islice(estimates, warmup):
-                pass
-    for part in np.array_split(np.arange(frames), min(_ROUNDS, frames)):
-        ages_ms = []
-        with closing(odometer.stream(stream)) as estimates:
-            # The time until a stream runs is not that of a frame.
-            before = next(estimates).seq
+    live = odometer.mode is Mode.LIVE
+    with closing(odometer.stream(stream)) as estimates:
+        for _ in islice(estimates, warmup):
+            pass
+        for part in np.array_split(np.arange(frames), min(_ROUNDS, frames)):
+            # What came while bare calls were timed, or lies ready since.
+            lying = islice(estimates, odometer.threads + AHEAD)
+            before = [estimate.seq for estimate in lying][-1]
+            ages_ms = []
             cpu_begin, begin = process_time(), perf_counter()
             for estimate in islice(estimates, len(part)):
                 found.skipped += estimate.seq - before - 1
@@ -176,13 +176,13 @@ def _streams(
                     found.latency.add(estimate.latency_ms)
                     ages_ms.append(estimate.latency_ms["total"])
             spent_s, cpu_s = perf_counter() - begin, process_time() - cpu_begin
-        raw_ms = [_raw_ms(session, feeds) for _ in part]
-        found.raw_ms += raw_ms
-        found.wall_s += spent_s
-        found.cpu_s += cpu_s
-        live = odometer.mode is Mode.LIVE
-        whole_ms = float(np.median(ages_ms or [np.nan])) if live else 1e3 * spent_s / len(part)
-        found.ratios.append(whole_ms / float(np.median(raw_ms)))
+            raw_ms = [_raw_ms(session, feeds) for _ in part]
+            found.raw_ms += raw_ms
+            found.wall_s += spent_s
+            found.cpu_s += cpu_s
+            if ages_ms:
+                whole_ms = float(np.median(ages_ms)) if live else 1e3 * spent_s / len(ages_ms)
+                found.ratios.append(whole_ms / float(np.median(raw_ms)))
     return found
 
 

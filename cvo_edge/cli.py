@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import sys
+import threading
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType
@@ -164,7 +166,7 @@ def bench(
     frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 200,
     warmup: Annotated[int, typer.Option(min=0, help="Frames before those.")] = 20,
     mode: Annotated[
-        ModeName, typer.Option(help="As for run; live plays 30 frames a second, or SOURCE's own.")
+        ModeName, typer.Option(help="As for run; live plays files at 30 frames a second.")
     ] = ModeName.LATENCY,
     threads: ThreadsOption = None,
     cache: CacheOption = True,
@@ -359,12 +361,29 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
         code = 0
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
+    except Terminated:
+        code = 128 + signal.SIGTERM
     except OSError as error:
         # What the modules did not foresee: a path too long, standard output on a full disk.
         failed = SourceError if error.filename else SinkError
         where = error.filename or "standard output"
         code = _complain(program, f"{where}: {error.strerror}", failed.exit_code)
         _drop_stdout()
+    _leave(code)
+
+
+def _leave(code: int) -> NoReturn:
+    """End the process, also where a thread waits for a camera that gives no more frames.
+
+    Python would end such a thread inside OpenCV, which takes the process with it, exit code and
+    all. Everything of ours is written by now.
+    """
+    if any(thread.name == "cvo-edge reader" for thread in threading.enumerate()):
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                with contextlib.suppress(OSError, ValueError):
+                    stream.flush()
+        os._exit(code)
     sys.exit(code)
 
 
@@ -381,8 +400,12 @@ def _drop_stdout() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+class Terminated(SystemExit):
+    """SIGTERM has come: what is open is to be closed, and the process to end."""
+
+
 def _terminate(number: int, _: FrameType | None) -> NoReturn:
-    raise SystemExit(128 + number)
+    raise Terminated(128 + number)
 
 
 def main() -> NoReturn:

@@ -126,6 +126,9 @@ def cache_lines(cache: ModelCache) -> list[str]:
     """Return what a cache holds for a person."""
     entries = cache.entries()
     lines = [f"folder       {cache.folder}, {len(entries)} prepared model(s)"]
+    obstacle = cache.obstacle()
+    if obstacle is not None:
+        lines.append(f"not used     {obstacle}")
     for entry in entries:
         made = f"sha256 {entry.model_sha256[:16]}..., onnxruntime {entry.onnxruntime}"
         other = "" if entry.current else ", of another machine or release"

@@ -2,7 +2,7 @@
 
 - ``latency``: one frame after the other, each as fast as all cores make it.
 - ``throughput``: as many frames at a time as there are cores, each on one of them; the most frames
-  a second, each of them slower. Order is kept.
+  a second, each of them slower. Order is kept. Estimates come in bunches: it is for recordings.
 - ``live``: the newest frame of a steady camera, with little processor time: no thread waits by
   spinning, and frames that came while another one was at work are left out.
 """
@@ -10,19 +10,19 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeVar
 
-from cvo_edge.errors import CvoError, UsageError
+from cvo_edge.errors import UsageError
 from cvo_edge.session import checked_threads
 
 Result = TypeVar("Result")
 
-# Started beside those at work, so that a slow one does not keep the others waiting.
-_AHEAD = 2
+# Queued behind those at work, so that a slow one does not keep the others waiting.
+AHEAD = 2
 
 
 class Mode(StrEnum):
@@ -61,7 +61,7 @@ def checked_mode(mode: Mode | str) -> Mode:
         raise UsageError(f"mode: expected one of {', '.join(Mode)}, found {mode!r}") from None
 
 
-def in_order(tasks: Iterable[Callable[[], Result]], workers: int) -> Iterator[Result]:
+def in_order(tasks: Iterable[Callable[[], Result]], workers: int) -> Generator[Result, None, None]:
     """Run tasks in ``workers`` threads and yield what they return, in their order.
 
     Tasks are taken as they are needed: never more than a few are under way. What a task raises, or
@@ -72,7 +72,7 @@ def in_order(tasks: Iterable[Callable[[], Result]], workers: int) -> Iterator[Re
         try:
             for task in _failing_last(tasks):
                 pending.append(pool.submit(task))
-                while pending and (len(pending) >= workers + _AHEAD or pending[0].done()):
+                while pending and (len(pending) >= workers + AHEAD or pending[0].done()):
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()
@@ -85,7 +85,7 @@ def _failing_last(tasks: Iterable[Callable[[], Result]]) -> Iterator[Callable[[]
     """Tasks, and where their source ends with an error one more that raises it."""
     try:
         yield from tasks
-    except CvoError as error:
+    except Exception as error:  # noqa: BLE001 - raised in its place
         failure = error
 
         def fail() -> Result:

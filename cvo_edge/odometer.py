@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 from time import perf_counter
 from types import TracebackType
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import preprocess
 from cvo_edge.artifact import Bundle, Calibration, Threshold, read_bundle
-from cvo_edge.errors import BundleMismatchError, CalibrationFileError, UsageError
+from cvo_edge.errors import BundleMismatchError, CalibrationFileError, ModelError, UsageError
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.loading import PreparedBundle, load_bundle
 from cvo_edge.modes import Mode, checked_mode, in_order, plan
@@ -31,7 +34,7 @@ from cvo_edge.pose import (
 )
 from cvo_edge.prepared import ModelCache
 from cvo_edge.session import Session
-from cvo_edge.sources import Frame, Newest, Source
+from cvo_edge.sources import Frame, Newest, Played, Source
 
 Array = NDArray[np.float64]
 
@@ -54,6 +57,13 @@ class Observation:
     fault: Reason | None = None
     preprocess_ms: float = 0.0
     model_ms: float = 0.0
+
+
+class _Settings(TypedDict):
+    threads: int | None
+    mode: Mode | str
+    confidence: float
+    scope: Scope
 
 
 class Odometer:
@@ -143,7 +153,19 @@ class Odometer:
         """
         folder = Path(bundle)
         content = read_bundle(folder) if cache is None else load_bundle(folder, cache)
-        return cls(content, threads=threads, mode=mode, confidence=confidence, scope=scope)
+        settings: _Settings = {
+            "threads": threads,
+            "mode": mode,
+            "confidence": confidence,
+            "scope": scope,
+        }
+        try:
+            return cls(content, **settings)
+        except ModelError:
+            if isinstance(content, Bundle):
+                raise
+            # Someone has cleared the cache in between.
+            return cls(read_bundle(folder), **settings)
 
     def __enter__(self) -> Odometer:
         """Return itself."""
@@ -196,25 +218,49 @@ class Odometer:
         """Step through a source, or through frames or bare BGR images, lazily, in its order.
 
         The mode says how. In ``throughput`` the files of a source are also read and decoded beside
-        each other. In ``live`` only the newest frame is used; the numbers of those that were left
-        out are missing in ``seq``. Raises what the source raises, and in ``live`` UsageError for
-        frames that neither come from a camera nor have stamps.
+        each other; an estimate is given once the next frame is there, so that it is not for a
+        camera. In ``live`` only the newest frame is used; the numbers of those that were left out
+        are missing in ``seq``. A recording is played by its stamps then, frames of your own come
+        when they come. Images of your own may be written over once the next one is asked for.
+        Raises what the source raises, and in ``live`` UsageError for a recording without stamps.
         """
         if self.mode is Mode.THROUGHPUT:
-            reads = frames.reads() if isinstance(frames, Source) else map(_already_read, frames)
-            yield from in_order(map(self._task, reads), self._workers)
-            return
-        if self.mode is Mode.LIVE:
-            live = isinstance(frames, Source) and frames.live
-            frames = Newest(map(_as_frame, frames), live=live)
-        for frame in map(_as_frame, frames):
+            yield from self._beside_each_other(
+                frames.reads() if isinstance(frames, Source) else map(_already_read, frames)
+            )
+        elif self.mode is Mode.LIVE:
+            yield from self._newest(frames)
+        else:
+            yield from self._one_by_one(map(_as_frame, frames))
+
+    def _newest(self, frames: Iterable[Frame | NDArray[Any]]) -> Iterator[PoseInterval]:
+        if not isinstance(frames, Source):
+            coming: Iterable[Frame] = map(_kept, frames)
+        else:
+            coming = frames if frames.live else Played(frames)
+        with closing(iter(Newest(coming))) as newest:
+            try:
+                yield from self._one_by_one(newest)
+            finally:
+                if isinstance(coming, Played):
+                    coming.stop()
+
+    def _one_by_one(self, frames: Iterable[Frame]) -> Iterator[PoseInterval]:
+        for frame in frames:
             self._seq += frame.skipped
             yield self._estimate(frame, self._next_seq())
 
-    def _task(self, read: Callable[[], Frame]) -> Callable[[], PoseInterval]:
-        """What a worker does for one frame, which has its number before it is read."""
-        seq = self._next_seq()
-        return lambda: self._estimate(read(), seq)
+    def _beside_each_other(self, reads: Iterable[Callable[[], Frame]]) -> Iterator[PoseInterval]:
+        numbered = zip(count(self._seq), reads, strict=False)
+        tasks = (partial(self._read_and_estimate, seq, read) for seq, read in numbered)
+        with closing(in_order(tasks, self._workers)) as estimates:
+            for estimate in estimates:
+                # Those under way when a stream is left have not been given to anyone.
+                self._seq = estimate.seq + 1
+                yield estimate
+
+    def _read_and_estimate(self, seq: int, read: Callable[[], Frame]) -> PoseInterval:
+        return self._estimate(read(), seq)
 
     def _next_seq(self) -> int:
         seq = self._seq
@@ -251,7 +297,8 @@ class Odometer:
 
     def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
         """Run the network on one image; the checks on image and outputs are in ``fault``."""
-        if self.session is None:
+        session = self.session
+        if session is None:
             raise UsageError("Odometer: expected an open one, found it closed")
         if image_bgr is None:
             return _faulty(Reason.IMAGE_UNREADABLE)
@@ -262,7 +309,7 @@ class Odometer:
         spec = self.calibration.preprocess
         tensor = preprocess.model_input(image, spec.height, spec.width, spec.crop)
         ready = perf_counter()
-        outputs = self.session.run({"image": tensor, **self.head.extra_inputs(seq)})
+        outputs = session.run({"image": tensor, **self.head.extra_inputs(seq)})
         done = perf_counter()
         pose, point, fault = self._checked(outputs)
         return Observation(outputs, pose, point, fault, 1e3 * (ready - start), 1e3 * (done - ready))
@@ -347,8 +394,16 @@ def _as_frame(frame: Frame | NDArray[Any]) -> Frame:
     return frame if isinstance(frame, Frame) else Frame(frame, None, "", 0.0)
 
 
+def _kept(frame: Frame | NDArray[Any]) -> Frame:
+    """A frame of a caller's, who may write the next image into the same memory."""
+    given = _as_frame(frame)
+    image = given.image
+    return replace(given, image=image.copy() if isinstance(image, np.ndarray) else image)
+
+
 def _already_read(frame: Frame | NDArray[Any]) -> Callable[[], Frame]:
-    return lambda: _as_frame(frame)
+    kept = _kept(frame)
+    return lambda: kept
 
 
 def _faulty(reason: Reason) -> Observation:

@@ -14,6 +14,7 @@ import contextlib
 import hashlib
 import os
 import platform
+import re
 import shutil
 import stat
 import tempfile
@@ -35,6 +36,7 @@ CACHE_VARIABLE = "CVO_EDGE_CACHE"
 # Hashed beside each other: one core takes 50 ms for the weights of a ResNet34.
 _CHUNK_BYTES = 8 << 20
 _UNFINISHED = ".unfinished-"
+_ENTRY_NAME = re.compile("[0-9a-f]{32}")
 # A build takes seconds: what is older was interrupted.
 _STALE_SECONDS = 3600.0
 # A file that changed less than this ago may change again without a sign: clocks tick slowly.
@@ -107,19 +109,22 @@ class ModelCache:
                 raise UsageError(f"{CACHE_VARIABLE}: expected an absolute path, found {named!r}")
             return cls(Path(named))
         caches = os.environ.get("XDG_CACHE_HOME", "")
-        base = Path(caches) if Path(caches).is_absolute() else Path("~/.cache").expanduser()
-        return cls(base / "cvo-edge")
+        if Path(caches).is_absolute():
+            return cls(Path(caches) / "cvo-edge")
+        try:
+            return cls(Path("~/.cache/cvo-edge").expanduser())
+        except RuntimeError:
+            # A user without a home: a folder that cannot be made.
+            return cls(Path(os.devnull) / "cvo-edge")
 
     def find(self, model_sha256: str) -> Prepared | None:
         """Return the entry of a model if this machine has one and its bytes are unchanged.
 
         A changed one is removed.
         """
-        if not self._trusted():
+        if self.obstacle() is not None:
             return None
         folder = self._entry_folder(model_sha256)
-        if not folder.is_dir():
-            return None
         try:
             entry = msgspec.json.decode((folder / ENTRY_FILE).read_bytes(), type=Entry)
             graph = (folder / GRAPH_FILE).read_bytes()
@@ -129,8 +134,11 @@ class ModelCache:
                 and hashlib.sha256(graph).hexdigest() == entry.graph_sha256
                 and file_digest(folder / WEIGHTS_FILE) == entry.weights_sha256
             )
-        except (OSError, msgspec.DecodeError):
+        except (FileNotFoundError, msgspec.DecodeError):
             unchanged = False
+        except OSError:
+            # Too many open files, say: nothing is wrong with the entry.
+            return None
         if unchanged:
             return Prepared(folder, graph)
         self.forget(model_sha256)
@@ -157,7 +165,7 @@ class ModelCache:
         """Return a folder to write an entry's files to; None where none can be made."""
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if not self._trusted():
+            if self.obstacle() is not None:
                 return None
             self._sweep()
             return Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=self.folder))
@@ -198,11 +206,10 @@ class ModelCache:
         """Return what the cache holds, in order of its names."""
         found = []
         for folder in self._folders():
-            try:
-                entry = msgspec.json.decode((folder / ENTRY_FILE).read_bytes(), type=Entry)
-                size = sum(path.stat().st_size for path in folder.iterdir())
-            except (OSError, msgspec.DecodeError):
+            entry = _read_entry(folder)
+            if entry is None:
                 continue
+            size = sum(path.stat().st_size for path in folder.iterdir())
             found.append(
                 Listed(
                     entry.name,
@@ -218,18 +225,34 @@ class ModelCache:
         """Remove every entry and what interrupted builds left; returns how many entries."""
         count = 0
         for folder in self._folders():
-            count += not folder.name.startswith(_UNFINISHED)
             shutil.rmtree(folder, ignore_errors=True)
+            count += not folder.name.startswith(_UNFINISHED) and not folder.exists()
         return count
+
+    def obstacle(self) -> str | None:
+        """Say why this cache is not used; None where it is, or could be made."""
+        try:
+            found = self.folder.stat()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            return f"cannot be read: {error.strerror}"
+        if not stat.S_ISDIR(found.st_mode):
+            return "expected a folder, found another kind"
+        if found.st_uid != os.getuid() or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            return "expected a folder of this user's that nobody else may write to"
+        if not os.access(self.folder, os.R_OK | os.W_OK | os.X_OK):
+            return "expected a folder that may be written to"
+        return None
 
     def _folders(self) -> list[Path]:
         """Folders of ours: a cache that someone put elsewhere may lie among other files."""
-        if not self.folder.is_dir():
+        if self.obstacle() is not None or not self.folder.exists():
             return []
         return [
             path
             for path in sorted(self.folder.iterdir())
-            if path.is_dir() and (path.name.startswith(_UNFINISHED) or (path / ENTRY_FILE).exists())
+            if path.name.startswith(_UNFINISHED) or _is_entry(path)
         ]
 
     def _sweep(self) -> None:
@@ -237,17 +260,26 @@ class ModelCache:
             if time.time() - path.stat().st_mtime > _STALE_SECONDS:
                 shutil.rmtree(path, ignore_errors=True)
 
-    def _trusted(self) -> bool:
-        """Whether the folder is this user's, and nobody else's to write to."""
-        try:
-            found = self.folder.stat()
-        except OSError:
-            return False
-        return found.st_uid == os.getuid() and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-
     def _entry_folder(self, model_sha256: str) -> Path:
         key = "\n".join((model_sha256, _onnxruntime_version(), _processor()))
         return self.folder / hashlib.sha256(key.encode()).hexdigest()[:32]
+
+
+def _is_entry(folder: Path) -> bool:
+    """Whether a folder has the name of an entry and holds nothing else, whole or damaged."""
+    ours = (GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE, SEEN_FILE)
+    return (
+        _ENTRY_NAME.fullmatch(folder.name) is not None
+        and folder.is_dir()
+        and all(path.name.startswith(ours) for path in folder.iterdir())
+    )
+
+
+def _read_entry(folder: Path) -> Entry | None:
+    try:
+        return msgspec.json.decode((folder / ENTRY_FILE).read_bytes(), type=Entry)
+    except (OSError, msgspec.DecodeError):
+        return None
 
 
 def identity(path: Path) -> FileIdentity | None:

@@ -6,11 +6,11 @@ import glob
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from threading import Condition, Thread
+from threading import Condition, Event, Thread
 from time import perf_counter
 from typing import Any, Protocol, runtime_checkable
 
@@ -22,6 +22,13 @@ from cvo_edge.errors import SourceError, UsageError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 
+# How long a stream that has ended waits for a frame that is on its way.
+_PATIENCE_S = 2.0
+# Stamps are nanoseconds in 64 bits, also after years.
+LOWEST_FPS, HIGHEST_FPS = 1e-3, 1e6
+
+READER = "cvo-edge reader"
+
 _JPEG_END = b"\xff\xd9"
 
 
@@ -29,8 +36,8 @@ _JPEG_END = b"\xff\xd9"
 class Frame:
     """One image of a source, or its absence.
 
-    ``image`` is (height, width, 3) uint8 BGR, or None where it could not be read whole; of callers
-    of their own it is whatever ``Odometer.step`` takes;
+    ``image`` is (height, width, 3) uint8 BGR, or None where it could not be read whole; who makes
+    frames of their own may put in whatever ``Odometer.step`` takes;
     ``stamp_ns`` is None where the source has no clock; ``read_ms`` what reading and decoding took,
     without waiting for a camera; ``waited_ms`` how long it lay ready since; ``skipped`` how many
     frames of the source before it were left out.
@@ -78,10 +85,10 @@ def open_source(text: str, fps: float | None = None) -> Source:
     SourceError
         There is no such source, or no image in it.
     UsageError
-        ``fps`` is not positive.
+        ``fps`` is out of range.
     """
-    if fps is not None and not 0.0 < fps < float("inf"):
-        raise UsageError(f"fps: expected a positive number, found {fps}")
+    if fps is not None and not LOWEST_FPS <= fps <= HIGHEST_FPS:
+        raise UsageError(f"fps: expected {LOWEST_FPS:g} to {HIGHEST_FPS:g}, found {fps:g}")
     path = Path(text)
     if path.is_dir():
         return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
@@ -230,27 +237,24 @@ class Newest:
     """The newest frame of a source, which does not wait for whoever looks at it.
 
     A thread reads on; frames that were not looked at before the next one came are left out, and
-    counted in ``Frame.skipped``. A source that is not live is played at the pace of its stamps.
+    counted in ``Frame.skipped``.
     """
 
-    def __init__(self, source: Iterable[Frame], *, live: bool) -> None:
-        self._source = source
-        self._live = live
+    def __init__(self, frames: Iterable[Frame]) -> None:
+        self._frames = frames
         self._changed = Condition()
         self._frame: Frame | None = None
         self._ready_at = 0.0
         self._skipped = 0
         self._closed = False
         self._ended = False
-        self._failure: Exception | None = None
+        self._failure: BaseException | None = None
 
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield frames until the source ends; raises what it raised, after its last frame.
-
-        Raises UsageError where frames have no stamps to be played by.
-        """
-        # Nothing waits for it at the end: a camera may never give another frame.
-        Thread(target=self._read, name="reader", daemon=True).start()
+    def __iter__(self) -> Generator[Frame, None, None]:
+        """Yield frames until the source ends; raises what it raised, after its last frame."""
+        # A camera may never give another frame: nothing waits for ever for who waits for it.
+        reader = Thread(target=self._read, name=READER, daemon=True)
+        reader.start()
         try:
             while True:
                 with self._changed:
@@ -263,35 +267,64 @@ class Newest:
                 yield replace(frame, waited_ms=waited_ms, skipped=skipped)
         finally:
             self._closed = True
+            # A thread that Python ends inside OpenCV takes the process with it.
+            reader.join(_PATIENCE_S)
         if self._failure is not None:
             raise self._failure
 
     def _read(self) -> None:
         try:
-            for frame in self._source if self._live else _played(self._source):
+            for frame in self._frames:
                 with self._changed:
                     self._skipped += self._frame is not None
                     self._frame, self._ready_at = frame, perf_counter()
                     self._changed.notify()
                 if self._closed:
                     return
-        except Exception as error:  # noqa: BLE001 - raised by whoever iterates
+        except BaseException as error:  # noqa: BLE001 - raised by whoever iterates
             self._failure = error
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify()
 
 
-def _played(source: Iterable[Frame]) -> Iterator[Frame]:
-    """Frames at the times of their stamps, the first one at once; late ones without a pause."""
-    begin = None
-    for frame in source:
-        if frame.stamp_ns is None:
-            raise UsageError("live: expected a camera, or frames with stamps (--fps), found none")
-        if begin is None:
-            begin = perf_counter() - 1e-9 * frame.stamp_ns
-        time.sleep(max(0.0, begin + 1e-9 * frame.stamp_ns - perf_counter()))
-        yield frame
+class Played:
+    """A recording at the times of its stamps, as a camera would give it; late frames at once.
+
+    Raises UsageError for a frame without a stamp.
+    """
+
+    live = True
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self.length = source.length
+        self._stopped = Event()
+
+    def reads(self) -> Iterator[Callable[[], Frame]]:
+        """Yield the frames, read, each at its time."""
+        for frame in self:
+            yield partial(_itself, frame)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames, each at its time, until ``stop``."""
+        begin = None
+        for frame in self._source:
+            if frame.stamp_ns is None:
+                raise UsageError(
+                    "live: expected a camera, or frames with stamps (--fps), found none"
+                )
+            if begin is None:
+                begin = perf_counter() - 1e-9 * frame.stamp_ns
+            pause_s = begin + 1e-9 * frame.stamp_ns - perf_counter()
+            if self._stopped.wait(max(0.0, pause_s)):
+                return
+            yield frame
+
+    def stop(self) -> None:
+        """End the play, whoever is waiting for its next frame."""
+        self._stopped.set()
 
 
 def _read_file(path: Path, stamp_ns: int | None) -> Frame:

@@ -95,12 +95,14 @@ def _correct_biases(
             # An exporter leaves out a bias of zeros.
             node.input.append("")
         else:
-            bias = constants[node.input[2]]
-            shift += numpy_helper.to_array(bias)
-            model.graph.initializer.remove(bias)
+            shift += numpy_helper.to_array(constants[node.input[2]])
         corrected = numpy_helper.from_array(shift.astype(np.float32), f"{node.name}/corrected_bias")
         node.input[2] = corrected.name
         model.graph.initializer.append(corrected)
+    used = {name for node in model.graph.node for name in node.input}
+    for name, constant in constants.items():
+        if name not in used:
+            model.graph.initializer.remove(constant)
 
 
 def _mean_channels(

@@ -7,12 +7,13 @@ import threading
 import time
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 
 from cvo_edge import Frame, Odometer, SourceError, UsageError, open_source
 from cvo_edge.modes import Mode, in_order, plan
-from cvo_edge.sources import Newest
+from cvo_edge.sources import READER, Newest, Played
 
 
 def test_each_mode_uses_as_many_threads_as_it_is_given():
@@ -54,18 +55,19 @@ def test_an_error_comes_in_its_place():
     def fails():
         raise ValueError("third")
 
-    def ending():
+    def ending(error):
         yield from (lambda: 1, lambda: 2)
-        raise SourceError("ended early")
+        raise error
 
     results = in_order([lambda: 1, lambda: 2, fails, lambda: 4], 2)
     assert [next(results), next(results)] == [1, 2]
     with pytest.raises(ValueError, match="third"):
         next(results)
-    results = in_order(ending(), 2)
-    assert [next(results), next(results)] == [1, 2]
-    with pytest.raises(SourceError, match="ended early"):
-        next(results)
+    for error in (SourceError("ended early"), KeyError("ended early")):
+        results = in_order(ending(error), 2)
+        assert [next(results), next(results)] == [1, 2]
+        with pytest.raises(type(error), match="ended early"):
+            next(results)
 
 
 def picture_free(number):
@@ -91,20 +93,26 @@ class Stepping:
         """Let so many frames come, and wait until they have been taken."""
         expected = self.asked + count
         self.go.release(count)
+        self.wait(expected)
+
+    def wait(self, asked):
+        """Wait until so many frames have been asked for."""
         deadline = time.monotonic() + 30
-        while self.asked < expected and time.monotonic() < deadline:
+        while self.asked < asked and time.monotonic() < deadline:
             time.sleep(0.001)
-        assert self.asked == expected
+        assert self.asked == asked
 
 
-@pytest.mark.parametrize("failure", [None, SourceError("camera 0: gave no frame after 6 frames")])
+FAILURES = [None, SourceError("camera 0: gave no frame after 6 frames"), SystemExit(3)]
+
+
+@pytest.mark.parametrize("failure", FAILURES)
 def test_the_newest_frame_is_seen_and_the_others_are_counted(failure):
     source = Stepping(6, failure)
-    newest = iter(Newest(source, live=True))
+    newest = iter(Newest(source))
     source.go.release()
-    assert (next(newest).source, source._count) == ("0", 6)
-    while source.asked < 2:
-        time.sleep(0.001)
+    assert next(newest).source == "0"
+    source.wait(2)
     source.give(3)
     frame = next(newest)
     assert (frame.source, frame.skipped) == ("3", 2)
@@ -112,17 +120,60 @@ def test_the_newest_frame_is_seen_and_the_others_are_counted(failure):
     source.give(2)
     frame = next(newest)
     assert (frame.source, frame.skipped) == ("5", 1)
-    with pytest.raises(SourceError if failure else StopIteration):
+    with pytest.raises(type(failure) if failure else StopIteration):
         next(newest)
 
 
 def test_files_are_played_no_faster_than_their_stamps():
-    frames = [Frame(None, number * 20_000_000, str(number), 0.0) for number in range(4)]
     begin = time.monotonic()
-    seen = list(Newest(frames, live=False))
+    seen = list(Newest(Played(Recorded(4, step_ns=20_000_000))))
     assert time.monotonic() - begin >= 0.06
     assert seen[-1].source == "3"
     assert sum(frame.skipped + 1 for frame in seen) == 4
+
+
+class Recorded:
+    """A recording without images."""
+
+    live = False
+
+    def __init__(self, length, step_ns):
+        self.length, self._step_ns = length, step_ns
+
+    def __iter__(self):
+        for number in range(self.length):
+            yield Frame(None, number * self._step_ns, str(number), 0.0)
+
+    def reads(self):
+        for frame in self:
+            yield lambda frame=frame: frame
+
+
+def readers():
+    return [thread for thread in threading.enumerate() if thread.name == READER]
+
+
+def test_nothing_reads_on_when_a_live_stream_is_left(bundle_dir):
+    with Odometer.load(bundle_dir, mode="live") as odometer:
+        for _ in odometer.stream(Recorded(3, step_ns=100 * 10**9)):
+            break
+    assert readers() == []
+
+
+def test_a_video_that_is_left_while_it_is_read_ends_the_process_as_ever(
+    bundle_dir, clip_dir, tmp_path
+):
+    # Large: most of the time the reader is inside of OpenCV.
+    frame = next(iter(open_source(str(clip_dir))))
+    path = tmp_path / "large.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (2560, 1920))
+    for _ in range(20):
+        writer.write(cv2.resize(frame.image, (2560, 1920)))
+    writer.release()
+    command = [sys.executable, "-c", "from cvo_edge.cli import main; main()", "run"]
+    arguments = [str(bundle_dir), str(path), "--mode", "live", "--max-frames", "2", "--quiet"]
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr, len(done.stdout.splitlines())) == (0, "", 2)
 
 
 def test_what_cannot_be_played_is_refused(bundle_dir, clip_dir):
@@ -150,6 +201,33 @@ def test_every_mode_gives_the_same_numbers(bundle_dir, clip_dir):
     numbers = [seq for seq, _, _ in found[Mode.LIVE].values()]
     assert all(a < b for a, b in pairwise(numbers))
     assert numbers[-1] == 49  # the last one is never left out
+
+
+def test_a_caller_may_write_the_next_image_into_the_same_memory(bundle_dir, clip_dir):
+    images = [frame.image for frame in list(open_source(str(clip_dir)))[:12]]
+
+    def refilled():
+        memory = np.empty_like(images[0])
+        for image in images:
+            np.copyto(memory, image)
+            yield memory
+
+    found = {}
+    for mode in (Mode.LATENCY, Mode.THROUGHPUT):
+        with Odometer.load(bundle_dir, mode=mode, threads=2) as odometer:
+            found[mode] = [estimate.lower.tolist() for estimate in odometer.stream(refilled())]
+    assert found[Mode.THROUGHPUT] == found[Mode.LATENCY]
+
+
+@pytest.mark.parametrize("mode", [Mode.LATENCY, Mode.THROUGHPUT])
+def test_numbers_go_on_where_a_stream_was_left(bundle_dir, clip_dir, mode):
+    with Odometer.load(bundle_dir, mode=mode, threads=2) as odometer:
+        for _ in range(2):
+            stream = odometer.stream(open_source(str(clip_dir)))
+            first = [next(stream).seq, next(stream).seq]
+            stream.close()
+        assert first == [2, 3]
+        assert odometer.step(None).seq == 4
 
 
 def test_a_mode_on_the_command_line(bundle_dir, clip_dir):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from cvo_edge.artifact import Bundle, read_bundle
+from cvo_edge.describe import cache_lines
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 from cvo_edge.loading import PreparedBundle, load_bundle
 from cvo_edge.odometer import Odometer
@@ -24,6 +25,7 @@ from cvo_edge.prepared import (
     ModelCache,
     file_digest,
 )
+from cvo_edge.selftest import check_selftest
 from cvo_edge.sources import open_source
 
 CVO_EDGE = [sys.executable, "-c", "from cvo_edge.cli import main; main()"]
@@ -208,9 +210,68 @@ def test_clear_removes_what_is_the_caches_own(bundle_dir, cache):
     cache.new_folder()
     (cache.folder / "someone's").mkdir()
     (cache.folder / "note.txt").write_text("mine")
+    # Of another program that keeps such a file, and one that even has such names.
+    for name in ("data", 32 * "a"):
+        (cache.folder / name).mkdir()
+        (cache.folder / name / ENTRY_FILE).write_text("{}")
+        (cache.folder / name / "thesis.txt").write_text("mine")
     assert [entry.current for entry in cache.entries()] == [True]
     assert cache.clear() == 1
-    assert sorted(path.name for path in cache.folder.iterdir()) == ["note.txt", "someone's"]
+    left = sorted(path.name for path in cache.folder.iterdir())
+    assert left == [32 * "a", "data", "note.txt", "someone's"]
+
+
+def test_a_damaged_entry_can_be_cleared(bundle_dir, cache):
+    load_bundle(bundle_dir, cache)
+    (entry_folder(cache) / ENTRY_FILE).write_text("{")
+    assert cache.entries() == []
+    assert cache.clear() == 1
+    assert list(cache.folder.iterdir()) == []
+
+
+def test_an_entry_that_cannot_be_read_now_is_kept(bundle_dir, bundle, cache, monkeypatch):
+    load_bundle(bundle_dir, cache)
+    with monkeypatch.context() as patch:
+        patch.setattr("cvo_edge.prepared.file_digest", too_many_open_files)
+        assert isinstance(load_bundle(bundle_dir, cache), Bundle)
+    assert cache.find(bundle.calibration.model.sha256) is not None
+
+
+def too_many_open_files(path):
+    raise OSError(24, "Too many open files")
+
+
+def test_an_entry_that_vanishes_while_it_is_loaded_is_done_without(bundle_dir, cache, monkeypatch):
+    def load_and_clear(folder, of):
+        found = load_bundle(folder, of)
+        of.clear()
+        return found
+
+    load_bundle(bundle_dir, cache)
+    monkeypatch.setattr("cvo_edge.odometer.load_bundle", load_and_clear)
+    with Odometer.load(bundle_dir, cache=cache) as odometer:
+        assert check_selftest(odometer) < odometer.calibration.selftest.tolerance
+
+
+def test_a_user_without_a_home_has_no_cache(bundle_dir, monkeypatch):
+    monkeypatch.delenv("CVO_EDGE_CACHE", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "expanduser", homeless)
+    assert isinstance(load_bundle(bundle_dir, ModelCache.default()), Bundle)
+    assert ModelCache.default().clear() == 0
+    assert ModelCache.default().entries() == []
+
+
+def homeless(path):
+    raise RuntimeError("Could not determine home directory.")
+
+
+def test_the_list_says_why_a_cache_is_not_used(bundle_dir, cache):
+    load_bundle(bundle_dir, cache)
+    assert cache.obstacle() is None
+    cache.folder.chmod(0o775)
+    assert "nobody else may write to" in (cache.obstacle() or "")
+    assert any(line.startswith("not used") for line in cache_lines(cache))
 
 
 def test_the_folder_is_named_by_the_environment(monkeypatch, tmp_path):
