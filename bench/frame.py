@@ -3,9 +3,10 @@
     python bench/frame.py
 
 For every method, whole MobileNetV2 and ResNet34 at 224x224 and the demonstrations' network, in
-float32 and 8 bits, on frames of 640x480. In turns: the bare call of onnxruntime on an input that is
-ready (``raw``), array to intervals (``step``), JPEG file to JSON record in a file (``record``), and
-the same network without what only intervals need, from array to pose (``pose_alone``).
+float32 and 8 bits, on frames of 640x480; CJP's networks also at 240x240, to which such frames are
+halved and nothing else. Two by two in turns: the bare call of onnxruntime on an input that is ready
+(``raw``), array to intervals (``step``), JPEG file to JSON record in a file (``record``), and the
+same network without what only intervals need, from array to pose (``pose_alone``).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from networks import (
     BACKBONES,
+    HALVED,
     METHODS,
     PRECISIONS,
     WORK,
@@ -27,7 +29,7 @@ from networks import (
     pose_alone,
     whole_bundle,
 )
-from rounds import figures, interleaved, ratio, write_report
+from rounds import Array, figures, interleaved, ratio, write_report
 
 from cvo_edge import preprocess
 from cvo_edge.artifact import Bundle, read_bundle
@@ -114,18 +116,33 @@ class Timed:
 
 
 def measured(folder: Path, rounds: int, scope: Scope = "marginal") -> dict[str, Any]:
-    """Time one bundle: all four calls in turns."""
+    """Time one bundle: each two that are compared in turns, as a loop would run either."""
     with Sink(str(WORK / "records.jsonl"), "jsonl") as sink:
         timed = Timed(read_bundle(folder), sink, scope)
-        ms = interleaved(timed.calls(), rounds=rounds, warmup=WARM_UP, before=timed.before())
-    more_ms = ms["step"] - ms["pose_alone"]
+        calls, before = timed.calls(), timed.before()
+
+        def pair(first: str, second: str) -> tuple[Array, Array]:
+            timed.conformal_ms.clear()
+            two = {name: calls[name] for name in (first, second)}
+            ms = interleaved(two, rounds=rounds, warmup=WARM_UP, before=before)
+            return ms[first], ms[second]
+
+        record, raw_beside_record = pair("record", "raw")
+        step_beside_alone, alone = pair("step", "pose_alone")
+        step, raw = pair("step", "raw")
+    more_ms = step_beside_alone - alone
     return {
-        "ms": {kind: figures(values) for kind, values in ms.items()},
-        "step_over_raw": ratio(ms["step"], ms["raw"]),
-        "step_minus_raw_ms": figures(ms["step"] - ms["raw"]),
-        "record_over_raw": ratio(ms["record"], ms["raw"]),
+        "ms": {
+            "raw": figures(raw),
+            "step": figures(step),
+            "record": figures(record),
+            "pose_alone": figures(alone),
+        },
+        "step_over_raw": ratio(step, raw),
+        "step_minus_raw_ms": figures(step - raw),
+        "record_over_raw": ratio(record, raw_beside_record),
         "uncertainty_ms": figures(more_ms),
-        "cost_of_uncertainty": round(float(np.median(more_ms) / np.median(ms["pose_alone"])), 4),
+        "cost_of_uncertainty": round(float(np.median(more_ms) / np.median(alone)), 4),
         "after_network_ms": figures(np.array(timed.conformal_ms[WARM_UP:])),
     }
 
@@ -176,6 +193,11 @@ def main() -> None:
             found["fp32_over_int8"] = precisions(folders, ROUNDS)
             print(f"{'':<22} fp32 / int8 {found['fp32_over_int8']['median']:.2f}", flush=True)
             results[backbone][method] = found
+    results["halved"] = {}
+    for backbone in BACKBONES:
+        found = measured(whole_bundle("cjp", backbone, size=HALVED), ROUNDS)
+        results["halved"][backbone] = found
+        print(f"{backbone:<16} {HALVED} {line(found)}", flush=True)
     write_report("frame", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP)
 
 
