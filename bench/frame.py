@@ -87,9 +87,9 @@ class Timed:
         self._feeds["image"] = self._input()
 
     def raw(self, _: int) -> None:
-        """Run the bare call."""
+        """Run the bare call, its threads where ours are."""
         if self._odometer.session:
-            self._odometer.session.engine.run(None, self._feeds)
+            self._odometer.session.run(self._feeds)
 
     def step(self, number: int) -> None:
         """From an array to intervals."""

@@ -29,8 +29,9 @@ from cvo_edge import preprocess
 from cvo_edge.odometer import Odometer
 from cvo_export.run import PoseGraph, load_run
 
-THREADS, ROUNDS, WARM_UP = 2, 100, 10
-PAUSE_S = 0.01
+THREADS, ROUNDS, WARM_UP = 2, 40, 5
+# OpenMP's threads look for work for a fifth of a second after a call.
+PAUSE_S = 0.25
 # Of a float32 peer's numbers from ours: in metres, radians and quaternion units, and in standard
 # deviations of that output over the images that are compared.
 LARGEST_DIFFERENCE, LARGEST_SHARE = 1e-3, 0.1

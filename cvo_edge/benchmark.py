@@ -227,7 +227,7 @@ _RATIOS = {
 
 def _raw_ms(session: Session, feeds: dict[str, Any]) -> float:
     begin = perf_counter()
-    session.engine.run(None, feeds)
+    session.run(feeds)
     return 1e3 * (perf_counter() - begin)
 
 

@@ -11,6 +11,7 @@ import onnxruntime
 import pytest
 
 from cvo_edge import session
+from cvo_edge.errors import ModelError
 from cvo_edge.session import allowed_cores, cgroup_cores
 
 
@@ -58,6 +59,35 @@ def test_cores_are_those_of_affinity_and_quota(monkeypatch, quota, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5})
     monkeypatch.setattr("cvo_edge.session.cgroup_cores", lambda: quota)
     assert allowed_cores() == expected
+
+
+@pytest.mark.parametrize(
+    ("cores", "threads", "expected"),
+    [
+        ({0, 1}, 2, [0, 1]),
+        ({7, 4, 6}, 3, [4, 6, 7]),
+        ({0, 1}, 1, []),
+        ({0, 1, 2, 3}, 2, []),
+        ({0}, 2, []),
+    ],
+)
+def test_every_core_has_one_thread_where_there_are_as_many(cores, threads, expected, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
+    assert session.cores_of_threads(threads) == expected
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="Linux alone has it")
+@pytest.mark.parametrize("spinning", [True, False])
+def test_a_callers_thread_is_where_it_was_after_an_inference(bundle, spinning):
+    cores = os.sched_getaffinity(0)
+    model = bundle.calibration.model
+    loaded = session.Session(bundle.model_bytes, len(cores), model, spinning=spinning)
+    image = np.zeros(model.inputs[0].shape, np.uint8)
+    loaded.run({"image": image})
+    assert os.sched_getaffinity(0) == cores
+    with pytest.raises(ModelError):
+        loaded.run({"picture": image})
+    assert os.sched_getaffinity(0) == cores
 
 
 def test_sums_of_8_bit_products_are_exact_as_a_session_is_set_up():
