@@ -37,15 +37,17 @@ _LEAST_WEIGHT = 1e-8
 
 
 def quantised(content: bytes, feeds: Sequence[Feed]) -> bytes:
-    """Return the graph with its backbone in 8 bits, but for its first convolution.
+    """Return the graph with its backbone in 8 bits.
 
-    That one sees the image itself, whose 8 bits are not to be rounded once more. ``feeds`` are
-    inputs by name, of frames that the ranges of the feature maps are taken from.
+    The first convolution takes the image's own 8 bits, where the graph begins as our exporter
+    writes it, and stays in float32 elsewhere: normalised pixels are not to be rounded once more.
+    ``feeds`` are inputs by name, of frames that the ranges of the feature maps are taken from.
     """
     model = onnx.shape_inference.infer_shapes(onnx.load_from_string(content))
     nodes = _backbone_nodes(model)
     first = next(node for node in nodes if node.op_type == "Conv")
-    chosen = [node for node in nodes if node is not first]
+    zero = _fold_normalisation(model, first)
+    chosen = [node for node in nodes if zero is not None or node is not first]
     _correct_biases(model, [node for node in chosen if node.op_type == "Conv"], feeds)
     kept = list(model.metadata_props)
     # Else it asks on stderr for what the exporter has done: folded normalisations, known shapes.
@@ -65,10 +67,78 @@ def quantised(content: bytes, feeds: Sequence[Feed]) -> bytes:
             calibrate_method=CalibrationMethod.MinMax,
         )
         found = onnx.load(target)
+    if zero is not None:
+        _take_pixels(found, first.input[0], zero)
     del found.metadata_props[:]
     found.metadata_props.extend(kept)
     written: bytes = found.SerializeToString()
     return written
+
+
+def _fold_normalisation(model: ModelProto, first: NodeProto) -> int | None:
+    """Put pixel scaling into the first convolution; returns the pixel that is its zero, or None.
+
+    Of (x - mean) / std a convolution takes W / std of x - zero instead, and the rest goes into its
+    bias: (W / std) (zero - mean). Where it pads, the border is of that pixel instead of the mean.
+    None, and nothing is changed, where the graph does not begin so.
+    """
+    graph = model.graph
+    constants = {constant.name: constant for constant in graph.initializer}
+    made = {output: node for node in graph.node for output in node.output}
+    divide = made.get(first.input[0])
+    subtract = made.get(divide.input[0]) if divide is not None else None
+    cast = made.get(subtract.input[0]) if subtract is not None else None
+    chain = [node.op_type if node is not None else "" for node in (cast, subtract, divide)]
+    readers = [name for node in graph.node for name in node.input].count(first.input[0])
+    if chain != ["Cast", "Sub", "Div"] or readers != 1 or subtract is None or divide is None:
+        return None
+    mean, std = (
+        numpy_helper.to_array(constants[node.input[1]]).astype(np.float64)
+        for node in (subtract, divide)
+    )
+    zero = int(np.clip(np.round(mean.mean()), 0, 255))
+    weight = numpy_helper.to_array(constants[first.input[1]]).astype(np.float64) / std
+    shift = (weight * (zero - mean)).sum(axis=(1, 2, 3))
+    if len(first.input) == 3:
+        shift += numpy_helper.to_array(constants[first.input[2]])
+    else:
+        first.input.append("")
+    for index, values in ((1, weight), (2, shift)):
+        name = f"{first.name}/of_pixels_{index}"
+        graph.initializer.append(numpy_helper.from_array(values.astype(np.float32), name))
+        first.input[index] = name
+    graph.initializer.append(numpy_helper.from_array(np.array(zero, np.float32), "zero_pixel"))
+    subtract.input[1] = "zero_pixel"
+    first.input[0] = subtract.output[0]
+    graph.node.remove(divide)
+    _drop_unused(model)
+    return zero
+
+
+def _take_pixels(model: ModelProto, name: str, zero: int) -> None:
+    """Let who reads the quantised x - zero read the image's 8 bits, which are the same numbers."""
+    graph = model.graph
+    made = {output: node for node in graph.node for output in node.output}
+    subtract = made[name]
+    cast = made[subtract.input[0]]
+    quantise = next(n for n in graph.node if n.op_type == "QuantizeLinear" and n.input[0] == name)
+    for label, value in (("pixel_scale", np.float32(1.0)), ("pixel_zero", np.uint8(zero))):
+        graph.initializer.append(numpy_helper.from_array(np.asarray(value), label))
+    for node in graph.node:
+        if node.op_type == "DequantizeLinear" and node.input[0] == quantise.output[0]:
+            node.input[:] = [cast.input[0], "pixel_scale", "pixel_zero"]
+    for node in (quantise, subtract, cast):
+        graph.node.remove(node)
+    _drop_unused(model)
+
+
+def _drop_unused(model: ModelProto) -> None:
+    """Remove constants that no node reads any more."""
+    graph = model.graph
+    used = {name for node in graph.node for name in node.input}
+    kept = [constant for constant in graph.initializer if constant.name in used]
+    del graph.initializer[:]
+    graph.initializer.extend(kept)
 
 
 def _correct_biases(
@@ -99,10 +169,7 @@ def _correct_biases(
         corrected = numpy_helper.from_array(shift.astype(np.float32), f"{node.name}/corrected_bias")
         node.input[2] = corrected.name
         model.graph.initializer.append(corrected)
-    used = {name for node in model.graph.node for name in node.input}
-    for name, constant in constants.items():
-        if name not in used:
-            model.graph.initializer.remove(constant)
+    _drop_unused(model)
 
 
 def _mean_channels(

@@ -15,6 +15,7 @@ from cvo_edge.conformal import conformal_quantile
 from cvo_edge.odometer import Odometer
 from cvo_edge.selftest import check_selftest
 from cvo_edge.session import Session
+from cvo_export.backbone import Backbone, BackboneConfig
 from cvo_export.calibrate import observe
 from cvo_export.heads.cqr import CqrConfig
 from cvo_export.publish import publish
@@ -62,7 +63,46 @@ def kinds(content):
     return [node.op_type for node in onnx.load_from_string(content).graph.node]
 
 
-def test_weights_are_eight_bits_but_those_of_the_first_convolution(both):
+def backbone_graph(normalisation):
+    """A small network as the exporter writes them: pixels scaled first; and feeds."""
+    config = BackboneConfig(stages=("8",), grid=(1, 1), normalisation=normalisation)
+    torch.manual_seed(0)
+    image = torch.zeros((1, 48, 64, 3), dtype=torch.uint8)
+    content = export_onnx(Backbone(config, 48, 64).eval(), [image], ["image"], ["features"])
+    generator = np.random.default_rng(0)
+    feeds = [
+        {"image": generator.integers(0, 256, (1, 48, 64, 3)).astype(np.uint8)} for _ in range(16)
+    ]
+    return content, feeds
+
+
+@pytest.mark.parametrize("normalisation", ["half", "timm"])
+def test_every_convolution_is_in_eight_bits_and_the_first_takes_the_pixels(normalisation):
+    content, feeds = backbone_graph(normalisation)
+    small = quantised(content, feeds)
+    model = onnx.load_from_string(small)
+    made = {output: node for node in model.graph.node for output in node.output}
+    constants = {constant.name: constant for constant in model.graph.initializer}
+    convolutions = [node for node in model.graph.node if node.op_type == "Conv"]
+    for node in convolutions:
+        weight = constants[made[node.input[1]].input[0]]
+        assert weight.data_type == onnx.TensorProto.INT8
+        # A scale for every channel.
+        assert list(constants[made[node.input[1]].input[1]].dims) == list(weight.dims[:1])
+    pixels = made[convolutions[0].input[0]]
+    assert pixels.op_type == "DequantizeLinear"
+    assert made[pixels.input[0]].op_type == "Transpose"
+    assert not {"Cast", "Sub", "Div"} & set(kinds(small))
+    # No constant is left that nobody reads.
+    read = {name for node in model.graph.node for name in node.input}
+    assert set(constants) <= read
+    plain, eight = Session(content, 1), Session(small, 1)
+    expected = np.concatenate([plain.run(feed)["features"] for feed in feeds])
+    found = np.concatenate([eight.run(feed)["features"] for feed in feeds])
+    assert np.abs(found - expected).max() < 0.1 * np.abs(expected).max()
+
+
+def test_where_the_graph_begins_otherwise_the_first_convolution_stays_float(both):
     content, small, _ = both
     model = onnx.load_from_string(small)
     made = {output: node for node in model.graph.node for output in node.output}
@@ -71,11 +111,7 @@ def test_weights_are_eight_bits_but_those_of_the_first_convolution(both):
     assert first.input[1] in constants
     assert len(others) == 2
     for node in others:
-        dequantised = made[node.input[1]]
-        assert dequantised.op_type == "DequantizeLinear"
-        assert constants[dequantised.input[0]].data_type == onnx.TensorProto.INT8
-        # A scale for every channel.
-        assert list(constants[dequantised.input[1]].dims) == [16 if node is others[0] else 8]
+        assert made[node.input[1]].op_type == "DequantizeLinear"
     assert "QuantizeLinear" not in kinds(content)
 
 
