@@ -53,8 +53,8 @@ JOINT_SHARE = 5
 CONTROL_FRAMES = 5
 LEAST_SATURATION_M = 1e-3
 
-# Their sets move by whole classes, or by whole leaves of a forest.
-STEPWISE = ("csp", "cqr")
+# Their sets move by whole classes.
+STEPWISE = ("csp",)
 
 _RUNTIME = ("-c", "from cvo_edge.cli import main; main()")
 

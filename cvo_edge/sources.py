@@ -295,17 +295,9 @@ class Played:
     Raises UsageError for a frame without a stamp.
     """
 
-    live = True
-
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Iterable[Frame]) -> None:
         self._source = source
-        self.length = source.length
         self._stopped = Event()
-
-    def reads(self) -> Iterator[Callable[[], Frame]]:
-        """Yield the frames, read, each at its time."""
-        for frame in self:
-            yield partial(_itself, frame)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames, each at its time, until ``stop``."""
