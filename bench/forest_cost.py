@@ -19,7 +19,7 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from uncertainty_cost import pose_alone
+from networks import pose_alone
 
 from cvo_edge import preprocess
 from cvo_edge.artifact import read_bundle

@@ -29,19 +29,23 @@ def interleaved(
     rounds: int,
     warmup: int,
     pause_s: float = 0.0,
+    warm_calls: int = 0,
     before: Mapping[str, Callable[[int], object]] | None = None,
 ) -> dict[str, Array]:
     """Milliseconds of each call in each round, (rounds,); a call is given the round's number.
 
     Who begins changes from round to round: whoever comes later finds warmer caches. With a
-    pause behind each call, threads that go on looking for work do not slow down the next one. What
-    is to be done ``before`` a call is not timed.
+    pause behind each call, threads that go on looking for work do not slow down the next one; after
+    it, and after a neighbour that fills every cache, untimed ``warm_calls`` make of the timed one
+    what it is in a loop. What is to be done ``before`` a call is not timed either.
     """
     names = list(calls)
     spent = {name: np.empty(warmup + rounds) for name in names}
     for number in range(warmup + rounds):
         first = number % len(names)
         for name in names[first:] + names[:first]:
+            for _ in range(warm_calls):
+                calls[name](number)
             if before:
                 before[name](number)
             begin = perf_counter()
