@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import mmap
 import os
 import platform
 import re
@@ -20,6 +19,7 @@ import shutil
 import stat
 import tempfile
 import time
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,8 +33,8 @@ GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
 SEEN_FILE = "seen.json"
 CACHE_VARIABLE = "CVO_EDGE_CACHE"
 
-# Hashed beside each other: one core takes 50 ms for the weights of a ResNet34.
-_CHUNK_BYTES = 8 << 20
+# What a core's own cache holds.
+_CHUNK_BYTES = 1 << 20
 _UNFINISHED = ".unfinished-"
 _ENTRY_NAME = re.compile("[0-9a-f]{32}")
 # A build takes seconds: what is older was interrupted.
@@ -46,14 +46,14 @@ _MOST_SEEN = 16
 
 
 class Entry(Struct, frozen=True, forbid_unknown_fields=True):
-    """``entry.json``: what was prepared, by what, for what, and the digests of both files."""
+    """``entry.json``: what was prepared, by what, for what, and what both files hold."""
 
     name: str
     model_sha256: str
     onnxruntime: str
     processor: str
     graph_sha256: str
-    weights_sha256: str
+    weights_crc32: list[int]
 
 
 class FileIdentity(Struct, frozen=True, array_like=True):
@@ -132,7 +132,7 @@ class ModelCache:
                 (entry.model_sha256, entry.onnxruntime, entry.processor)
                 == (model_sha256, _onnxruntime_version(), _processor())
                 and hashlib.sha256(graph).hexdigest() == entry.graph_sha256
-                and file_digest(folder / WEIGHTS_FILE) == entry.weights_sha256
+                and file_checksums(folder / WEIGHTS_FILE) == entry.weights_crc32
             )
         except (FileNotFoundError, msgspec.DecodeError):
             unchanged = False
@@ -184,7 +184,7 @@ class ModelCache:
                 onnxruntime=_onnxruntime_version(),
                 processor=_processor(),
                 graph_sha256=hashlib.sha256((new / GRAPH_FILE).read_bytes()).hexdigest(),
-                weights_sha256=file_digest(new / WEIGHTS_FILE),
+                weights_crc32=file_checksums(new / WEIGHTS_FILE),
             )
             (new / ENTRY_FILE).write_bytes(msgspec.json.encode(entry))
             # Whole or not at all; a folder that is there and not empty is left as it is.
@@ -303,26 +303,28 @@ def _seen(prepared: Prepared) -> list[FileIdentity]:
         return []
 
 
-def file_digest(path: Path) -> str:
-    """Digest of a file, of the digests of its chunks, taken beside each other; raises OSError.
+def file_checksums(path: Path) -> list[int]:
+    """CRC-32 of each MiB of a file, by all cores beside each other; raises OSError.
 
-    Not the file's sha256; as hard to forge, and as fast as there are cores. Nothing is kept in
-    memory.
+    Against damage, as disks and memory cards do it. Whoever means harm and may write to the cache
+    of this user could write the entry with its checksums, too.
     """
-    with path.open("rb") as stream:
+    with path.open("rb", buffering=0) as stream:
         size = os.fstat(stream.fileno()).st_size
-        if size == 0:
-            return hashlib.sha256().hexdigest()
-        # Mapped, as the engine will have it: read into memory, the chunks would stay there.
-        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        workers = os.cpu_count() or 1
 
-            def chunk(offset: int) -> bytes:
-                with memoryview(content) as view:
-                    return hashlib.sha256(view[offset : offset + _CHUNK_BYTES]).digest()
+        def checked(first: int) -> dict[int, int]:
+            buffer = memoryview(bytearray(_CHUNK_BYTES))
+            return {
+                offset: zlib.crc32(buffer[: os.preadv(stream.fileno(), [buffer], offset)])
+                for offset in range(first * _CHUNK_BYTES, size, workers * _CHUNK_BYTES)
+            }
 
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
-                digests = list(pool.map(chunk, range(0, size, _CHUNK_BYTES)))
-    return hashlib.sha256(size.to_bytes(8, "little") + b"".join(digests)).hexdigest()
+        found: dict[int, int] = {}
+        with ThreadPoolExecutor(workers) as pool:
+            for part in pool.map(checked, range(workers)):
+                found |= part
+    return [found[offset] for offset in sorted(found)]
 
 
 def _onnxruntime_version() -> str:

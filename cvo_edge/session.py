@@ -178,7 +178,8 @@ class Session:
             options.add_session_config_entry("session.intra_op_thread_affinities", others)
             # Where threads rest while they wait, the system finds the caller a better core.
             self._caller_core = {cores[0]} if spinning else set()
-        if saturates():
+        # float32 has no such products, and the first question takes milliseconds.
+        if (expected is None or expected.precision != "fp32") and saturates():
             options.add_session_config_entry("session.x64quantprecision", "1")
         options.log_severity_level = 4
         if keep_in is not None:

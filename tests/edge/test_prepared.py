@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from cvo_edge.prepared import (
     SEEN_FILE,
     WEIGHTS_FILE,
     ModelCache,
-    file_digest,
+    file_checksums,
 )
 from cvo_edge.selftest import check_selftest
 from cvo_edge.sources import open_source
@@ -232,7 +233,7 @@ def test_a_damaged_entry_can_be_cleared(bundle_dir, cache):
 def test_an_entry_that_cannot_be_read_now_is_kept(bundle_dir, bundle, cache, monkeypatch):
     load_bundle(bundle_dir, cache)
     with monkeypatch.context() as patch:
-        patch.setattr("cvo_edge.prepared.file_digest", too_many_open_files)
+        patch.setattr("cvo_edge.prepared.file_checksums", too_many_open_files)
         assert isinstance(load_bundle(bundle_dir, cache), Bundle)
     assert cache.find(bundle.calibration.model.sha256) is not None
 
@@ -285,19 +286,28 @@ def test_the_folder_is_named_by_the_environment(monkeypatch, tmp_path):
     assert ModelCache.default().folder == tmp_path / "cvo-edge"
 
 
-@pytest.mark.parametrize("size", [0, 1, (8 << 20) - 1, 8 << 20, (8 << 20) + 1])
-def test_a_files_digest_depends_on_every_byte_and_the_length(size, tmp_path):
+@pytest.mark.parametrize("size", [0, 1, (1 << 20) - 1, 1 << 20, (1 << 20) + 1, 5 << 20])
+def test_a_files_checksums_depend_on_every_byte_and_the_length(size, tmp_path):
     path = tmp_path / "file"
     path.write_bytes(bytes(size))
-    digests = {file_digest(path)}
+    found = {tuple(file_checksums(path))}
     path.write_bytes(bytes(size + 1))
-    digests.add(file_digest(path))
-    for place in {0, size // 2, size}:
+    found.add(tuple(file_checksums(path)))
+    places = {0, size // 2, size}
+    for place in places:
         changed = bytearray(size + 1)
         changed[place] = 1
         path.write_bytes(changed)
-        digests.add(file_digest(path))
-    assert len(digests) == 2 + len({0, size // 2, size})
+        found.add(tuple(file_checksums(path)))
+    assert len(found) == 2 + len(places)
+
+
+def test_a_files_checksums_are_those_of_its_parts(tmp_path):
+    content = np.random.default_rng(0).bytes((5 << 19) + 3)
+    path = tmp_path / "file"
+    path.write_bytes(content)
+    parts = [content[start : start + (1 << 20)] for start in range(0, len(content), 1 << 20)]
+    assert file_checksums(path) == [zlib.crc32(part) for part in parts]
 
 
 def test_a_bundle_without_a_cache_is_read_as_before(bundle_dir):
