@@ -1,0 +1,249 @@
+"""Print the tables of ``docs/performance.md`` from ``results/speed`` and ``results/boards``.
+
+    python bench/speed_tables.py
+
+A table whose program has not been run is left out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from networks import BACKBONES
+from rounds import RESULTS
+
+BOARDS = RESULTS.parent / "boards"
+SHORT = {"mobilenetv2_100": "MobileNetV2", "resnet34": "ResNet34", "demonstration": "cut short"}
+
+Rows = Iterator[list[str]]
+
+
+def number(value: float, digits: int = 2) -> str:
+    """Fixed digits, a dash where there is nothing."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def two(found: Mapping[str, float], digits: int = 2) -> str:
+    """Median and 95th percentile."""
+    return f"{found['median']:.{digits}f} ({found['p95']:.{digits}f})"
+
+
+def frame(results: dict[str, Any]) -> Rows:
+    """One frame of every bundle."""
+    yield [
+        *("network", "method", "", "raw call ms", "array to interval over it", "less it, ms"),
+        *("file to record over it", "cost of uncertainty", "after the network, ms"),
+    ]
+    for name, label in SHORT.items():
+        for method, found in results[name].items():
+            for precision in ("fp32", "int8"):
+                yield [label, method, precision, *_frame_cells(found[precision])]
+    for name, found in results["halved"].items():
+        yield [f"{SHORT[name]}, 240x240", "cjp", "fp32", *_frame_cells(found)]
+
+
+def _frame_cells(found: dict[str, Any]) -> list[str]:
+    return [
+        two(found["ms"]["raw"]),
+        two(found["step_over_raw"], 3),
+        two(found["step_minus_raw_ms"]),
+        two(found["record_over_raw"]),
+        number(found["cost_of_uncertainty"], 3),
+        two(found["after_network_ms"], 3),
+    ]
+
+
+def precision(results: dict[str, Any]) -> Rows:
+    """What 8 bits save in the bare call."""
+    methods = list(results[BACKBONES[0]])
+    yield ["float32 over 8 bits, raw call", *methods]
+    for name, label in SHORT.items():
+        yield [label, *(two(results[name][m]["fp32_over_int8"]) for m in methods)]
+
+
+def throughput(results: dict[str, Any]) -> Rows:
+    """JPEG files to records."""
+    yield ["network", "files to records", "ms a frame", "frames a second", "naive over this"]
+    for name in BACKBONES:
+        for what, row in results[name]["throughput"].items():
+            cells = [two(row["ms_per_frame"]), number(row["frames_per_second"], 0)]
+            yield [SHORT[name], what, *cells, two(row["naive_over_this"])]
+
+
+def camera(results: dict[str, Any]) -> Rows:
+    """A steady camera."""
+    yield [
+        *("network", "30 frames a second", "processor ms a frame", "over onnxruntime's"),
+        *("age of a frame, ms", "left out"),
+    ]
+    for name in BACKBONES:
+        for what, row in results[name]["camera"].items():
+            age = two(row["age_ms"]) if row["age_ms"] else "-"
+            cells = [two(row["cpu_ms_per_frame"]), two(row["over_onnxruntime"], 3), age]
+            yield [SHORT[name], what, *cells, f"{row['frames_skipped']} of {row['frames']}"]
+
+
+def neighbour(results: dict[str, Any]) -> Rows:
+    """Steps with and without a busy process beside them."""
+    calls = list(results[BACKBONES[0]]["neighbour"]["alone"])
+    yield ["network", "ms of a step: mode, threads", *calls]
+    for name in BACKBONES:
+        for what, row in results[name]["neighbour"].items():
+            yield [SHORT[name], what, *(two(row[call]) for call in calls)]
+
+
+def load(results: dict[str, Any]) -> Rows:
+    """Loading and memory."""
+    yield [
+        *("network", "", "load ms", "over onnxruntime"),
+        *("anonymous MiB", "over onnxruntime"),
+    ]
+    for name in BACKBONES:
+        for what, row in results[name]["load"].items():
+            cells = [
+                cell
+                for key, digits in (("load_ms", 1), ("anonymous_mib", 1))
+                for cell in (two(row[key], digits), number(row[key]["over_onnxruntime"], 3))
+            ]
+            yield [SHORT[name], what, *cells]
+
+
+def process(results: dict[str, Any]) -> Rows:
+    """Fresh processes."""
+    yield ["network", "smallest script, ms", "`cvo-edge run`, ms", "over the script"]
+    for name in BACKBONES:
+        row = results[name]["process"]
+        cells = [two(row["script_ms"], 0), two(row["cvo_edge_ms"], 0)]
+        yield [SHORT[name], *cells, two(row["over_script"], 3)]
+
+
+def peers(results: dict[str, Any]) -> Rows:
+    """Other engines."""
+    yield ["network", "engine", "", "ms", "over ours", "largest difference"]
+    for name in BACKBONES:
+        for engine, row in results[name].items():
+            difference = row.get("largest_difference")
+            cells = [two(row["ms"]), two(row["over_ours"])] if "ms" in row else ["not timed", "-"]
+            off = "-" if difference is None else f"{difference:.1e}"
+            yield [SHORT[name], engine, row["precision"], *cells, off]
+
+
+def uncertainty(results: dict[str, Any]) -> Rows:
+    """MC-dropout and ensembles."""
+    yield ["network", "", "form", "ms", "over ours"]
+    for name in BACKBONES:
+        yield [SHORT[name], "ours", "", two(results[name]["ours"]["ms"]), "1"]
+        for kind in ("mc-dropout", "ensemble"):
+            for form, row in results[name][kind]["forms"].items():
+                mark = ", fastest" if form == results[name][kind]["fastest"] else ""
+                yield [SHORT[name], kind, form + mark, two(row["ms"]), two(row["over_ours"])]
+
+
+def scaling(results: dict[str, Any]) -> Rows:
+    """Cost against settings."""
+    yield [
+        *("", "", "raw call ms", "array to interval over it", "uncertainty, ms"),
+        "after the network, ms",
+    ]
+    labels = {
+        "size": "input",
+        "rays": "J of MCQR",
+        "trees": "trees of CQR",
+        "classes": "K of CSP",
+    }
+    for key, label in labels.items():
+        for value, row in results[key].items():
+            shown = row["outputs"]["codebook"][1] if key == "rays" else value
+            yield [label, str(shown), *_scaling_cells(row)]
+            if "joint" in row:
+                yield [f"{label}, joint", str(shown), *_scaling_cells(row["joint"])]
+
+
+def _scaling_cells(row: dict[str, Any]) -> list[str]:
+    return [
+        two(row["ms"]["raw"]),
+        two(row["step_over_raw"], 3),
+        number(row["uncertainty_ms"]["median"], 3),
+        two(row["after_network_ms"], 3),
+    ]
+
+
+def confidences(results: dict[str, Any]) -> Rows:
+    """Cost of confidences."""
+    yield ["confidences stored", "reading calibration.json, ms", "all their sets, ms"]
+    for count, row in results["confidences"].items():
+        yield [count, two(row["read_calibration_ms"]), two(row["sets_ms"], 3)]
+
+
+def memory(results: dict[str, Any]) -> Rows:
+    """A long run."""
+    yield ["frames", "resident MiB, first and last hundredth", "growth MiB", "descriptors, threads"]
+    first, last = results["first"], results["last"]
+    growth = results["growth"]
+    yield [
+        f"{results['frames']:,}",
+        f"{first['rss']:.1f}, {last['rss']:.1f}",
+        number(results["growth_mib"]["rss"]),
+        f"{growth['descriptors']:+.0f}, {growth['threads']:+.0f}",
+    ]
+
+
+def board(figures: dict[str, Any]) -> Rows:
+    """Largest differences of each bundle on an emulated board, and what it covers there."""
+    yield [
+        *("bundle", "scope", "position um", "rotation urad", "bounds over mean width"),
+        *("moved sets", "coverage here", "there"),
+    ]
+    for report in figures["bundles"]:
+        for scope, found in report["scopes"].items():
+            off = found["difference"]
+            key = "all_six" if scope == "joint" else "per_dof"
+            covered = [f"{np.mean(row[key]):.3f}" for row in found["coverage"].values()]
+            yield [
+                *(report["name"], scope, f"{1e6 * off['position_m']:.3g}"),
+                *(f"{1e6 * off['rotation_rad']:.3g}", f"{off['bound_share']:.2g}"),
+                *(f"{off['moved']} of {6 * off['frames']}", *covered),
+            ]
+
+
+# Program that was run -> the tables of its results.
+TABLES: dict[str, tuple[Callable[[dict[str, Any]], Rows], ...]] = {
+    "frame": (frame, precision),
+    "stream": (throughput, camera, neighbour),
+    "start": (load, process),
+    "peers": (peers,),
+    "uncertainty_peers": (uncertainty,),
+    "scaling": (scaling, confidences),
+    "soak": (memory,),
+}
+
+
+def lines(rows: Rows) -> str:
+    """Return rows as a table, the first its head."""
+    head, *body = rows
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body)) + "\n"
+
+
+def tables() -> Iterator[tuple[str, str]]:
+    """Yield what was measured, and its table."""
+    for program, found in TABLES.items():
+        path: Path = RESULTS / f"{program}.json"
+        if path.exists():
+            results = json.loads(path.read_text("utf-8"))["results"]
+            yield from ((f"{program}: {each.__name__}", lines(each(results))) for each in found)
+    for path in sorted(BOARDS.glob("*.json")):
+        yield f"boards: {path.stem}", lines(board(json.loads(path.read_text("utf-8"))))
+
+
+def main() -> None:
+    """Print all of them."""
+    for name, table in tables():
+        print(f"{name}\n\n{table}")
+
+
+if __name__ == "__main__":
+    main()
