@@ -38,23 +38,24 @@ _UNTRAINED = "--split random --steps 100 --copies 0"
 
 
 def whole_bundle(
-    method: str, backbone: str, precision: str = "fp32", size: str = "224x224"
+    method: str,
+    backbone: str,
+    precision: str = "fp32",
+    size: str = "224x224",
+    provider: str = "onnxruntime",
 ) -> Path:
-    """Return a bundle of a whole network, made now if it is not there."""
+    """Return a bundle of a whole, hardly trained network, made now if it is not there."""
     name = f"{method}-{backbone}" if size == "224x224" else f"{method}-{backbone}-{size}"
     options = f"--backbone {backbone} {_WHOLE} --size {size} --weights {_random_weights(backbone)}"
-    return published(name, precision, f"{method} {ROOM}", options)
-
-
-def published(name: str, precision: str, what: str, options: str) -> Path:
-    """Return the bundle of a hardly trained run, made now if it is not there."""
     run, bundle = WORK / "runs" / name, WORK / f"{name}-{precision}"
+    if provider != "onnxruntime":
+        bundle = bundle.with_name(f"{bundle.name}-{provider}")
     if not bundle.exists():
-        method, data = what.split()
         features = str(WORK / "features")
         options = f"{options} {_UNTRAINED}"
-        _cvo_export("train", method, data, str(run), *options.split(), "--cache", features)
-        _cvo_export("publish", str(run), str(bundle), "--precision", precision)
+        _cvo_export("train", method, ROOM, str(run), *options.split(), "--cache", features)
+        how = ("--precision", precision, "--provider", provider)
+        _cvo_export("publish", str(run), str(bundle), *how)
     return bundle
 
 

@@ -55,9 +55,9 @@ class Network:
         """Path of the bundle's graph."""
         return str(self.bundle(precision) / "model.onnx")
 
-    def bundle(self, precision: str) -> Path:
+    def bundle(self, precision: str, provider: str = "onnxruntime") -> Path:
         """Folder of the bundle."""
-        return whole_bundle("cjp", self.backbone, precision)
+        return whole_bundle("cjp", self.backbone, precision, provider=provider)
 
     @cached_property
     def graph(self) -> PoseGraph:
@@ -247,6 +247,9 @@ def measured(backbone: str, peers: dict[str, Peer]) -> dict[str, Any]:
     calls: dict[str, Callable[[int], object]] = {}
     for precision, odometer in ours.items():
         calls[f"ours {precision}"] = over(pictures, odometer.step)
+    if "openvino" in peers:
+        odometer = Odometer.load(network.bundle("int8", "openvino"), threads=THREADS)
+        calls["ours int8, calibrated on openvino"] = over(pictures, odometer.step)
     for name, peer in peers.items():
         call = peer.load(network)
         off = np.abs(numbers(call, inputs) - exact)
@@ -268,7 +271,7 @@ def measured(backbone: str, peers: dict[str, Peer]) -> dict[str, Any]:
         calls, rounds=ROUNDS, warmup=WARM_UP, pause_s=PAUSE_S, warm_calls=WARM_CALLS
     )
     for name, ms in spent.items():
-        row = found.setdefault(name, {"precision": name.removeprefix("ours ")})
+        row = found.setdefault(name, {"precision": name.removeprefix("ours ").partition(",")[0]})
         against = "int8" if row["precision"] == "int8" else "fp32"
         row |= {"ms": figures(ms), "over_ours": ratio(ms, spent[f"ours {against}"])}
     found["ours int8"]["largest_difference"] = float(f"{rounding:.3g}")
@@ -277,7 +280,7 @@ def measured(backbone: str, peers: dict[str, Peer]) -> dict[str, Any]:
 
 def line(name: str, row: dict[str, Any]) -> str:
     """Return one engine's figures as text."""
-    start = f"  {name:<26} {row['precision']:<5}"
+    start = f"  {name:<34} {row['precision']:<5}"
     difference = f"difference {row.get('largest_difference', 0.0):.1e}"
     if "ms" not in row:
         return f"{start} not timed: other numbers than ours, {difference}"

@@ -47,6 +47,7 @@ SixOrUnbounded = tuple[
 ]
 Dtype = Literal["uint8", "float32"]
 Precision = Literal["fp32", "int8"]
+Provider = Literal["onnxruntime", "openvino"]
 MethodName = Literal["cqr", "csp", "mcqr", "cjp"]
 Quaternion = tuple[float, float, float, float]
 Parameters = TypeVar("Parameters", bound=Struct)
@@ -64,8 +65,11 @@ class TensorSpec(_Strict, frozen=True):
     shape: tuple[Annotated[int, Meta(ge=1)], ...]
 
 
-class ModelSpec(_Strict, frozen=True):
-    """Which model file this calibration belongs to."""
+class ModelSpec(_Strict, frozen=True, omit_defaults=True):
+    """Which model file this calibration belongs to, and the engine whose numbers it is about.
+
+    In 8 bits engines differ by more than a rounding: thresholds of one are not those of another.
+    """
 
     file: Literal["model.onnx"]
     sha256: Sha256
@@ -73,6 +77,7 @@ class ModelSpec(_Strict, frozen=True):
     precision: Precision
     inputs: tuple[TensorSpec, ...]
     outputs: tuple[TensorSpec, ...]
+    provider: Provider = "onnxruntime"
 
 
 class PreprocessSpec(_Strict, frozen=True):

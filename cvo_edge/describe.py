@@ -24,7 +24,8 @@ def inspect_lines(calibration: Calibration) -> list[str]:
     lines = [
         f"name         {calibration.name}",
         f"method       {calibration.method}, {source.score} score{_details(calibration)}",
-        f"model        {model.precision}, opset {model.opset}, sha256 {model.sha256[:16]}...",
+        f"model        {model.precision}, opset {model.opset}, sha256 {model.sha256[:16]}..., "
+        f"on {model.provider}",
         f"tensors      {tensors}",
         f"pose         {pose.target}, {pose.child_frame_id} in {pose.frame_id}, {pose.rotation}",
         f"calibrated   on {source.n} frames of {source.n_sequences} sequence(s) of "

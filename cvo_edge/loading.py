@@ -33,11 +33,14 @@ class PreparedBundle:
 def load_bundle(folder: Path, cache: ModelCache) -> Bundle | PreparedBundle:
     """Read and check a bundle folder; its model as the cache has it, or puts it there now.
 
-    The bundle as it is where the cache cannot be used. Errors are those of ``read_bundle``: a model
-    file that is not the calibrated one is refused, whatever the cache holds. The digest of one that
-    has not changed since it was last taken, as the system has it, is not taken again.
+    The bundle as it is where the cache cannot be used, or its model is of another provider. Errors
+    are those of ``read_bundle``: a model file that is not the calibrated one is refused, whatever
+    the cache holds. The digest of one that has not changed since it was last taken, as the system
+    has it, is not taken again.
     """
     calibration = read_calibration(folder)
+    if calibration.model.provider != "onnxruntime":
+        return read_bundle(folder)
     prepared = cache.find(calibration.model.sha256)
     if prepared is not None:
         model = folder / MODEL_FILE

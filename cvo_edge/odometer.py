@@ -33,6 +33,7 @@ from cvo_edge.pose import (
     unbounded_set,
 )
 from cvo_edge.prepared import ModelCache
+from cvo_edge.providers import open_session
 from cvo_edge.session import Session
 from cvo_edge.sources import Frame, Newest, Played, Source
 
@@ -120,8 +121,12 @@ class Odometer:
         settings = plan(self.mode, threads)
         self._workers = settings.workers
         self.threads = settings.threads * settings.workers
-        self.session: Session | None = Session(
-            model, settings.threads, calibration.model, spinning=settings.spinning
+        self.session: Session | None = open_session(
+            model,
+            settings.threads,
+            calibration.model,
+            spinning=settings.spinning,
+            at_once=settings.workers,
         )
         reference = calibration.pose.reference_q_xyzw
         self.chart = Chart(

@@ -99,6 +99,8 @@ def environment(threads: int | None = None) -> dict[str, Any]:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             versions[package] = "unknown"
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        versions["openvino"] = importlib.metadata.version("openvino")
     governor = _first_line(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor"))
     return {
         "cpu": _cpu_name(),

@@ -1,4 +1,7 @@
-"""The only file that knows onnxruntime: a model -> a session that checks what it is."""
+"""The only file that knows onnxruntime: a model -> a session that checks what it is.
+
+Bundles of another provider have their session in a file of its own, behind the same calls.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,16 @@ MAX_THREADS = 64
 # Smaller ones stay in the graph: shapes and scales, of no size.
 _SMALL_TENSOR = 1024
 
-_DTYPES: dict[str, Dtype] = {"tensor(uint8)": "uint8", "tensor(float)": "float32"}
+# As onnxruntime and as OpenVINO has them.
+_DTYPES: dict[str, Dtype] = {
+    "tensor(uint8)": "uint8",
+    "tensor(float)": "float32",
+    "u8": "uint8",
+    "f32": "float32",
+}
+
+# What a model declares of an input or output: name, type, and shape, whose sizes may be no numbers.
+Port = tuple[str, str, Sequence[Any]]
 
 
 def allowed_cores() -> int:
@@ -199,9 +211,18 @@ class Session:
             )
         # onnxruntime raises a dozen unrelated types here, UnicodeDecodeError among them.
         except Exception as error:
-            raise ModelError(f"model.onnx: refused by onnxruntime: {_one_line(error)}") from None
-        self.inputs = _tensors(self.engine.get_inputs(), "input")
-        self.outputs = _tensors(self.engine.get_outputs(), "output")
+            raise ModelError(f"model.onnx: refused by onnxruntime: {one_line(error)}") from None
+        self._declare(
+            [(each.name, each.type, each.shape) for each in self.engine.get_inputs()],
+            [(each.name, each.type, each.shape) for each in self.engine.get_outputs()],
+            expected,
+        )
+
+    def _declare(
+        self, inputs: Sequence[Port], outputs: Sequence[Port], expected: ModelSpec | None
+    ) -> None:
+        """Keep what the model itself declares, unless it is not what is expected."""
+        self.inputs, self.outputs = _tensors(inputs, "input"), _tensors(outputs, "output")
         if expected is not None:
             _compare("inputs", expected.inputs, self.inputs)
             _compare("outputs", expected.outputs, self.outputs)
@@ -210,16 +231,16 @@ class Session:
     def run(self, feeds: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.float32]]:
         """Input arrays by name -> output arrays by name; raises ModelError where it fails."""
         try:
-            if self._caller_core:
-                values = self._run_on_own_core(feeds)
-            else:
-                values = self.engine.run(None, feeds)
+            values = self._call(feeds)
         except Exception as error:
-            raise ModelError(f"model.onnx: inference failed: {_one_line(error)}") from None
+            raise ModelError(f"model.onnx: inference failed: {one_line(error)}") from None
         return dict(zip(self._names, values, strict=True))
 
-    def _run_on_own_core(self, feeds: Mapping[str, NDArray[np.generic]]) -> Sequence[Any]:
-        """Run while the calling thread is on the core that no other thread of ours has."""
+    def _call(self, feeds: Mapping[str, NDArray[np.generic]]) -> Sequence[Any]:
+        """Input arrays by name -> output arrays in the order of ``outputs``."""
+        if not self._caller_core:
+            return self.engine.run(None, feeds)  # type: ignore[no-any-return]
+        # The calling thread is on the core that no other thread of ours has.
         before = os.sched_getaffinity(0)
         os.sched_setaffinity(0, self._caller_core)
         try:
@@ -228,16 +249,15 @@ class Session:
             os.sched_setaffinity(0, before)
 
 
-def _tensors(arguments: list[onnxruntime.NodeArg], kind: str) -> tuple[TensorSpec, ...]:
+def _tensors(ports: Sequence[Port], kind: str) -> tuple[TensorSpec, ...]:
     tensors = []
-    for argument in arguments:
-        shape = tuple(argument.shape)
-        if argument.type not in _DTYPES or not all(isinstance(size, int) for size in shape):
+    for name, type_name, shape in ports:
+        if type_name not in _DTYPES or not all(isinstance(size, int) for size in shape):
             raise BundleMismatchError(
                 f"model.onnx: expected {kind}s of uint8 or float32 with fixed shapes, "
-                f"found {argument.name} {argument.type} {list(shape)}"
+                f"found {name} {type_name} {list(shape)}"
             )
-        tensors.append(TensorSpec(name=argument.name, dtype=_DTYPES[argument.type], shape=shape))
+        tensors.append(TensorSpec(name=name, dtype=_DTYPES[type_name], shape=tuple(shape)))
     return tuple(tensors)
 
 
@@ -257,6 +277,7 @@ def _listed(tensors: tuple[TensorSpec, ...]) -> str:
     return ", ".join(f"{spec.name} {spec.dtype} {list(spec.shape)}" for spec in tensors)
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: Exception | str) -> str:
+    """Return what an engine says as one line of bounded length."""
     line = " ".join(str(error).split())
     return line if len(line) <= 200 else line[:197] + "..."

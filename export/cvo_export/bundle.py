@@ -100,7 +100,9 @@ def write_bundle(bundle_dir: Path, calibration: Calibration, model_bytes: bytes)
     return artifact.read_calibration(bundle_dir)
 
 
-def model_spec(model_bytes: bytes, opset: int) -> artifact.ModelSpec:
+def model_spec(
+    model_bytes: bytes, opset: int, provider: artifact.Provider = "onnxruntime"
+) -> artifact.ModelSpec:
     """What the calibration says of a model; one that quantises anything is an int8 model."""
     session = Session(model_bytes)
     return artifact.ModelSpec(
@@ -110,6 +112,7 @@ def model_spec(model_bytes: bytes, opset: int) -> artifact.ModelSpec:
         precision=_precision(model_bytes),
         inputs=session.inputs,
         outputs=session.outputs,
+        provider=provider,
     )
 
 

@@ -147,6 +147,13 @@ class ScaleName(StrEnum):
     CONSTANT = "constant"
 
 
+class ProviderName(StrEnum):
+    """The engine that a bundle is calibrated on, and runs on."""
+
+    ONNXRUNTIME = "onnxruntime"
+    OPENVINO = "openvino"
+
+
 class PrecisionName(StrEnum):
     """Of the backbone's numbers."""
 
@@ -437,6 +444,9 @@ def publish(
     precision: Annotated[
         PrecisionName, typer.Option(help="int8: an 8-bit backbone, calibrated as such.")
     ] = PrecisionName.FP32,
+    provider: Annotated[
+        ProviderName, typer.Option(help="The engine that is calibrated, and that it runs on.")
+    ] = ProviderName.ONNXRUNTIME,
     rule: RuleOption = None,
     joint: JointOption = JointName.MAX,
     score: ScoreOption = None,
@@ -460,6 +470,7 @@ def publish(
         score=score,
         sides=sides.value if sides else None,
         precision=precision.value,
+        provider=provider.value,
     )
     print(*inspect_lines(calibration), sep="\n")
 
@@ -491,6 +502,10 @@ def calibrate(
         bool,
         typer.Option("--new-data", help="Bundle: the data are new, though of the same name."),
     ] = False,
+    provider: Annotated[
+        ProviderName | None,
+        typer.Option(help="The engine that it is to run on; the bundle's own, else onnxruntime."),
+    ] = None,
     name: NameOption = None,
 ) -> None:
     """Calibrate a network that is there, on data that it has not seen: your own, or a bundle's.
@@ -515,6 +530,7 @@ def calibrate(
         rotation=rotation.value if rotation else None,
         crop=crop.value if crop else None,
         new_data=new_data,
+        provider=provider.value if provider else None,
     )
     print(*inspect_lines(calibration), sep="\n")
 

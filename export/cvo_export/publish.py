@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvo_edge import artifact, preprocess
-from cvo_edge.artifact import Calibration, Precision
+from cvo_edge.artifact import Calibration, Precision, Provider
 from cvo_edge.errors import GateError
 from cvo_edge.heads.cqr import Sides
 from cvo_edge.session import Session
@@ -49,12 +49,13 @@ def publish(
     score: str | None = None,
     sides: Sides | None = None,
     precision: Precision = "fp32",
+    provider: Provider = "onnxruntime",
 ) -> Calibration:
     """Export and calibrate a finished run and write its bundle; returns the calibration.
 
     ``rule`` None is ``hierarchical`` for a run split by sequence, else ``pooled``; ``score`` None
     lets val decide. With ``int8`` the backbone is quantised first: scores and thresholds are those
-    of the very graph in the bundle.
+    of the very graph in the bundle, as the ``provider`` computes it.
 
     Raises
     ------
@@ -64,13 +65,15 @@ def publish(
         The folder cannot be written, or holds something that is no bundle.
     UsageError
         A score or sides that the method does not have.
+    ModelError
+        The provider is not installed, or does not know the graph.
     """
     check_target(bundle_dir)
     candidates = selected(run.graph.head.candidates(), score, sides)
     if rule is None:
         rule = "hierarchical" if run.split.kind == "sequence" else "pooled"
     model_bytes, parity = _export(run, precision)
-    draft = _draft(run, model_bytes, name, rule, joint, parity)
+    draft = _draft(run, model_bytes, name, rule, joint, parity, provider)
     calibration = calibrated(draft, model_bytes, run.dataset, run.split.roles, candidates)
     return write_bundle(bundle_dir, calibration, model_bytes)
 
@@ -130,12 +133,18 @@ def _compare(
 
 
 def _draft(
-    run: Run, model_bytes: bytes, name: str, rule: Rule, joint: Joint, parity: float
+    run: Run,
+    model_bytes: bytes,
+    name: str,
+    rule: Rule,
+    joint: Joint,
+    parity: float,
+    provider: Provider,
 ) -> Calibration:
     """Everything but score, thresholds and self-test."""
     config, target = run.config, run.target
     roles = run.split.roles
-    model = model_spec(model_bytes, OPSET)
+    model = model_spec(model_bytes, OPSET, provider)
     # Of all frames of these roles, also where a run was given a share: the unit of its score.
     known = target.coordinates(run.dataset.poses[np.concatenate([roles["train"], roles["fit"]])])
     return Calibration(

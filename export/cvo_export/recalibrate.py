@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from cvo_edge import artifact
-from cvo_edge.artifact import Calibration, PoseLimits, read_bundle
+from cvo_edge.artifact import Calibration, PoseLimits, Provider, read_bundle
 from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageError
 from cvo_edge.geometry import mean_rotation
 from cvo_edge.heads import HEADS
@@ -68,6 +68,7 @@ def recalibrate(
     rotation: GivenRotation | None = None,
     crop: Crop | None = None,
     new_data: bool = False,
+    provider: Provider | None = None,
 ) -> Calibration:
     """Calibrate a model file or the model of a bundle on a data set and write the new bundle.
 
@@ -77,7 +78,8 @@ def recalibrate(
     list alone is taken. Where it is the very data set that the bundle's run was split from, that
     run's own ``val`` and ``cal`` are used. ``rotation`` (None: ``tangent_predicted``) and ``crop``
     (None: ``none``) describe a model file. ``new_data`` says that a data set of the training data's
-    name holds none of its frames.
+    name holds none of its frames. ``provider`` (None: the bundle's own, else ``onnxruntime``) is
+    the engine that the new bundle is for.
 
     Raises
     ------
@@ -114,7 +116,8 @@ def recalibrate(
     source = replace(
         draft.calibration, rule=rule, joint=joint, split=split.spec(dataset), dataset=dataset.name
     )
-    draft = replace(draft, name=name, calibration=source)
+    own = provider or draft.model.provider
+    draft = replace(draft, name=name, calibration=source, model=replace(draft.model, provider=own))
     chosen_from = selected(candidates, score, sides)
     calibration = calibrated(draft, model_bytes, dataset, split.roles, chosen_from)
     return write_bundle(bundle_dir, calibration, model_bytes)

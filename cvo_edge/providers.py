@@ -1,0 +1,28 @@
+"""The engine that a calibration is about -> its session."""
+
+from __future__ import annotations
+
+from cvo_edge.artifact import ModelSpec
+from cvo_edge.prepared import Prepared
+from cvo_edge.session import Session
+
+
+def open_session(
+    model: bytes | Prepared,
+    threads: int,
+    expected: ModelSpec,
+    *,
+    spinning: bool = True,
+    at_once: int = 1,
+) -> Session:
+    """Open a session of the provider that a calibration is about.
+
+    ``at_once`` is the number of threads that will call it at the same time; the rest as in
+    ``Session``.
+    """
+    if expected.provider == "openvino" and isinstance(model, bytes):
+        # An optional package, and not a small one.
+        from cvo_edge.openvino_session import OpenvinoSession
+
+        return OpenvinoSession(model, threads, expected, at_once=at_once)
+    return Session(model, threads, expected, spinning=spinning)
