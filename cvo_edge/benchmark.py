@@ -107,6 +107,7 @@ def benchmark(
         "bundle": odometer.calibration.name,
         "method": odometer.calibration.method,
         "precision": odometer.calibration.model.precision,
+        "provider": odometer.calibration.model.provider,
         "mode": odometer.mode,
         "frames": frames,
         "frames_valid": found.valid,
@@ -203,9 +204,9 @@ def benchmark_lines(report: dict[str, Any]) -> list[str]:
     rows = {**report["latency_ms"], "bare model": report["raw_model_ms"]}
     where = report["environment"]
     return [
-        f"{report['bundle']} ({report['method']}, {report['precision']}), mode {report['mode']}: "
-        f"{report['frames']} frames after {report['warmup']} warm-up, {where['threads']} threads "
-        f"on {where['cpu']}",
+        f"{report['bundle']} ({report['method']}, {report['precision']} on {report['provider']}), "
+        f"mode {report['mode']}: {report['frames']} frames after {report['warmup']} warm-up, "
+        f"{where['threads']} threads on {where['cpu']}",
         header,
         *(f"{k:<12}" + "".join(f"{v:>9.3f}" for v in row.values()) for k, row in rows.items()),
         f"{_RATIOS[report['mode']]} over the bare model call: "
