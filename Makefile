@@ -16,10 +16,10 @@ help:
 	@echo "make arm64   test the runtime on an emulated 64-bit ARM, and compare its numbers with this machine's"
 	@echo "make avx2    the same on an x86-64 without VNNI (both: Linux with apt-get, as root for the emulator)"
 	@echo "make check   lint, formatting, types and import rules"
-	@echo "make bench   compare speed, memory and start side by side; half an hour on a quiet machine"
+	@echo "make bench   compare speed, memory and start side by side; an hour on a quiet machine"
 	@echo "make soak    a million frames: does memory grow? half an hour"
 	@echo "make format  reformat the code"
-	@echo "make clean   remove the virtual environments and emulated boards"
+	@echo "make clean   remove the virtual environments, emulated boards and networks of make bench"
 
 $(DEMO_VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(DEMO_VENV)
@@ -63,6 +63,7 @@ bench: $(VENV)/.installed
 	$(VENV)/bin/python bench/scaling.py
 	$(VENV)/bin/python bench/peers.py
 	$(VENV)/bin/python bench/uncertainty_peers.py
+	$(VENV)/bin/python bench/speed_tables.py
 	$(VENV)/bin/python bench/goals.py
 
 soak: $(VENV)/.installed
@@ -73,4 +74,4 @@ format: $(VENV)/.installed
 	$(VENV)/bin/ruff format .
 
 clean:
-	rm -rf $(VENV) $(DEMO_VENV) .boards $(addprefix demo-,$(METHODS:=.jsonl))
+	rm -rf $(VENV) $(DEMO_VENV) .boards build/bench $(addprefix demo-,$(METHODS:=.jsonl))

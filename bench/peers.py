@@ -23,7 +23,7 @@ import onnxruntime
 import torch
 from networks import BACKBONES, WORK, images, whole_bundle
 from numpy.typing import NDArray
-from rounds import Array, figures, interleaved, over, ratio, write_report
+from rounds import Array, figures, interleaved, just_written, ratio, write_report
 
 from cvo_edge import preprocess
 from cvo_edge.odometer import Odometer
@@ -245,11 +245,13 @@ def measured(backbone: str, peers: dict[str, Peer]) -> dict[str, Any]:
     rounding = float(np.abs(rounded - exact).max())
     found: dict[str, Any] = {}
     calls: dict[str, Callable[[int], object]] = {}
-    for precision, odometer in ours.items():
-        calls[f"ours {precision}"] = over(pictures, odometer.step)
+    before: dict[str, Callable[[int], object]] = {}
+    steps = {f"ours {precision}": odometer.step for precision, odometer in ours.items()}
     if "openvino" in peers:
         odometer = Odometer.load(network.bundle("int8", "openvino"), threads=THREADS)
-        calls["ours int8, calibrated on openvino"] = over(pictures, odometer.step)
+        steps["ours int8, calibrated on openvino"] = odometer.step
+    for name, step in steps.items():
+        before[name], calls[name] = just_written(pictures, step)
     for name, peer in peers.items():
         call = peer.load(network)
         off = np.abs(numbers(call, inputs) - exact)
@@ -266,9 +268,14 @@ def measured(backbone: str, peers: dict[str, Peer]) -> dict[str, Any]:
             right = difference <= LARGEST_ROUNDING * rounding
         # Written so that NaN is refused.
         if right:
-            calls[name] = over(network.frames, call)
+            before[name], calls[name] = just_written(network.frames, call)
     spent = interleaved(
-        calls, rounds=ROUNDS, warmup=WARM_UP, pause_s=PAUSE_S, warm_calls=WARM_CALLS
+        calls,
+        rounds=ROUNDS,
+        warmup=WARM_UP,
+        pause_s=PAUSE_S,
+        warm_calls=WARM_CALLS,
+        before=before,
     )
     for name, ms in spent.items():
         row = found.setdefault(name, {"precision": name.removeprefix("ours ").partition(",")[0]})

@@ -7,8 +7,10 @@ that; a median of ratios within a round does not.
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any, TypeVar
@@ -20,6 +22,7 @@ from cvo_edge.profile import environment
 
 RESULTS = Path(__file__).parent / "results" / "speed"
 Array = NDArray[np.float64]
+Array8 = NDArray[np.uint8]
 T = TypeVar("T")
 
 
@@ -42,8 +45,7 @@ def interleaved(
     names = list(calls)
     spent = {name: np.empty(warmup + rounds) for name in names}
     for number in range(warmup + rounds):
-        first = number % len(names)
-        for name in names[first:] + names[:first]:
+        for name in in_turn(names, number):
             for _ in range(warm_calls):
                 calls[name](number)
             if before:
@@ -55,9 +57,25 @@ def interleaved(
     return {name: values[warmup:] for name, values in spent.items()}
 
 
-def over(inputs: Sequence[T], call: Callable[[T], object]) -> Callable[[int], object]:
-    """Return a call for ``interleaved`` that is given one input a round, in their order."""
-    return lambda number: call(inputs[number % len(inputs)])
+def in_turn(each: Sequence[T], number: int) -> list[T]:
+    """Return all of them, another one first in every round."""
+    first = number % len(each)
+    return [*each[first:], *each[:first]]
+
+
+def just_written(
+    inputs: Sequence[Array8], call: Callable[[Array8], object]
+) -> tuple[Callable[[int], object], Callable[[int], object]]:
+    """Return what comes before a call, and the call, for ``interleaved``.
+
+    One input a round, in their order, each just written into the same memory: as a camera or a
+    decoder leaves it, and not as it was when it was last looked at.
+    """
+    kept = np.empty_like(inputs[0])
+    return (
+        lambda number: np.copyto(kept, inputs[number % len(inputs)]),
+        lambda _: call(kept),
+    )
 
 
 def figures(values: Array) -> dict[str, float]:
@@ -75,6 +93,8 @@ def write_report(name: str, results: Mapping[str, Any], **settings: object) -> N
     report = {
         "command": " ".join(["python", f"bench/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
         "settings": settings,
+        "date": datetime.now(UTC).date().isoformat(),
+        "commit": _commit(),
         "environment": environment(),
         "results": results,
     }
@@ -82,6 +102,18 @@ def write_report(name: str, results: Mapping[str, Any], **settings: object) -> N
     target = RESULTS / f"{name}.json"
     target.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
     print(f"-> {target}")
+
+
+def _commit() -> str:
+    """Return which commit of the repository this is, with a plus where files differ from it."""
+    command = ["git", "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
+    try:
+        done = subprocess.run(
+            command, cwd=RESULTS.parents[2], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return done.stdout.strip()
 
 
 def _four(value: float) -> float:

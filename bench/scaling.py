@@ -123,9 +123,10 @@ def main() -> None:
 
 def show(what: str, value: str, row: dict[str, Any]) -> None:
     """Print one line."""
+    cost = row["cost_of_uncertainty"]["median"]
     print(
         f"{what:<8} {value:>10}: raw {row['ms']['raw']['median']:.3f} ms, uncertainty "
-        f"{row['uncertainty_ms']['median']:+.3f} ms ({row['cost_of_uncertainty']:.3f}), of it "
+        f"{row['uncertainty_ms']['median']:+.3f} ms ({cost:.3f}), of it "
         f"after the network {row['after_network_ms']['median']:.3f} ms",
         flush=True,
     )

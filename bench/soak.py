@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 from collections.abc import Iterator
 from itertools import cycle
 from pathlib import Path
@@ -68,7 +67,7 @@ def main() -> None:
             sink.write(estimate)
             if (estimate.seq + 1) % max(1, count // READINGS) == 0:
                 open_files = len(list(Path("/proc/self/fd").iterdir()))
-                threads = threading.active_count()
+                threads = len(list(Path("/proc/self/task").iterdir()))
                 readings.append({**memory_mib(), "descriptors": open_files, "threads": threads})
                 print(f"{estimate.seq + 1:>9} frames: {readings[-1]}", flush=True)
 
@@ -88,7 +87,8 @@ def main() -> None:
         "last": readings[-1],
     }
     print(results)
-    write_report("soak", results, method=METHOD, precision="int8", mode=Mode.THROUGHPUT)
+    name = "soak" if count == FRAMES else f"soak-{count}"
+    write_report(name, results, method=METHOD, precision="int8", mode=Mode.THROUGHPUT)
 
 
 if __name__ == "__main__":

@@ -23,8 +23,8 @@ Rows = Iterator[list[str]]
 
 
 def number(value: float, digits: int = 2) -> str:
-    """Fixed digits, a dash where there is nothing."""
-    return "-" if value is None else f"{value:.{digits}f}"
+    """Fixed digits."""
+    return f"{value:.{digits}f}"
 
 
 def two(found: Mapping[str, float], digits: int = 2) -> str:
@@ -52,7 +52,7 @@ def _frame_cells(found: dict[str, Any]) -> list[str]:
         two(found["step_over_raw"], 3),
         two(found["step_minus_raw_ms"]),
         two(found["record_over_raw"]),
-        number(found["cost_of_uncertainty"], 3),
+        two(found["cost_of_uncertainty"], 3),
         two(found["after_network_ms"], 3),
     ]
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from networks import BACKBONES, WORK, frames, whole_bundle
-from rounds import Array, figures, interleaved, ratio, write_report
+from rounds import Array, figures, in_turn, interleaved, ratio, write_report
 
 METHOD, THREADS, ROUNDS, WARM_UP = "cjp", 2, 15, 2
 
@@ -69,8 +69,8 @@ def loaded(backbone: str) -> dict[str, Any]:
         "cvo-edge int8": [OURS, int8],
     }
     found: dict[str, list[dict[str, float]]] = {name: [] for name in commands}
-    for _ in range(WARM_UP + ROUNDS):
-        for name, command in commands.items():
+    for number in range(WARM_UP + ROUNDS):
+        for name, command in in_turn(list(commands.items()), number):
             found[name].append(json.loads(_run(command)))
 
     def values(name: str, key: str) -> Array:

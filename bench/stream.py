@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 import onnxruntime
 from networks import BACKBONES, WORK, frames, images, whole_bundle
-from rounds import figures, interleaved, ratio, write_report
+from rounds import figures, in_turn, interleaved, ratio, write_report
 
 from cvo_edge.artifact import read_bundle
 from cvo_edge.modes import Mode
@@ -95,11 +95,15 @@ class Recording:
 
 
 def throughput(backbone: str) -> dict[str, Any]:
-    """Time the whole folder by each, in turns; ratios are of the naive script over ours."""
+    """Time the whole folder by each, in turns; ratios are of the naive float32 script over each."""
     with ExitStack() as stack:
         sink = stack.enter_context(Sink(str(WORK / "records.jsonl"), "jsonl"))
         plain = whole_bundle(METHOD, backbone)
-        calls = {"naive": naive(as_it_comes(plain, THREADS), WORK / "naive.jsonl")}
+        eight = whole_bundle(METHOD, backbone, "int8")
+        calls = {
+            "naive": naive(as_it_comes(plain, THREADS), WORK / "naive.jsonl"),
+            "naive int8": naive(as_it_comes(eight, THREADS), WORK / "naive.jsonl"),
+        }
         for precision in ("fp32", "int8"):
             for mode in (Mode.LATENCY, Mode.THROUGHPUT):
                 bundle = read_bundle(whole_bundle(METHOD, backbone, precision))
@@ -146,8 +150,8 @@ def camera(backbone: str) -> dict[str, Any]:
         cpu_ms: dict[str, list[float]] = {name: [] for name in calls}
         ages_ms: dict[str, list[float]] = {name: [] for name in calls}
         skipped = dict.fromkeys(calls, 0)
-        for _ in range(CAMERA_ROUNDS):
-            for name, call in calls.items():
+        for number in range(CAMERA_ROUNDS):
+            for name, call in in_turn(list(calls.items()), number):
                 # What spins after the one before has come to rest.
                 time.sleep(1.0)
                 begin = process_time()

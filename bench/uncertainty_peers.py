@@ -25,7 +25,7 @@ import torch
 from networks import BACKBONES, WORK, images, open_branches, whole_bundle
 from numpy.typing import NDArray
 from onnx import compose
-from rounds import Array, figures, interleaved, over, ratio, write_report
+from rounds import Array, figures, interleaved, just_written, ratio, write_report
 from torch import Tensor, nn
 
 from cvo_edge import preprocess
@@ -219,13 +219,21 @@ def measured(backbone: str) -> dict[str, Any]:
     bundle = whole_bundle("cjp", backbone)
     kinds, pictures = forms(graphs(backbone)), images()
     with Odometer.load(bundle, threads=THREADS) as odometer:
-        calls = {"ours": over(pictures, odometer.step)}
+        before: dict[str, Callable[[int], object]] = {}
+        calls: dict[str, Callable[[int], object]] = {}
+        before["ours"], calls["ours"] = just_written(pictures, odometer.step)
         for kind, named in kinds.items():
             check(kind, named, pictures[0])
             for name, call in named.items():
-                calls[f"{kind}, {name}"] = over(pictures, partial(summary, call))
+                key = f"{kind}, {name}"
+                before[key], calls[key] = just_written(pictures, partial(summary, call))
         spent = interleaved(
-            calls, rounds=ROUNDS, warmup=WARM_UP, pause_s=PAUSE_S, warm_calls=WARM_CALLS
+            calls,
+            rounds=ROUNDS,
+            warmup=WARM_UP,
+            pause_s=PAUSE_S,
+            warm_calls=WARM_CALLS,
+            before=before,
         )
     ours = spent["ours"]
     found: dict[str, Any] = {"ours": {"ms": figures(ours)}}

@@ -51,6 +51,9 @@ class _Found:
     skipped: int = 0
     wall_s: float = 0.0
     cpu_s: float = 0.0
+    # From the first to the last of them, bare calls included.
+    all_s: float = 0.0
+    waited_s: float = 0.0
 
 
 def benchmark(
@@ -95,11 +98,8 @@ def benchmark(
     first = next(iter(stream))
     odometer.step(first.image)
     first_interval_ms = _process_age_ms()
-    begin, waited_s = perf_counter(), waited_for_cores_s()
     measure = _steps if odometer.mode is Mode.LATENCY else _streams
     found = measure(odometer, session, stream, frames, warmup)
-    thread_s = odometer.threads * (perf_counter() - begin)
-    waited = (waited_for_cores_s() - waited_s) / thread_s
     if not found.latency.count:
         raise SourceError(f"{source}: expected at least one valid frame, found none in {frames}")
     counted = found.latency.count
@@ -120,7 +120,7 @@ def benchmark(
         "load_ms": round(load_ms, 1),
         "first_interval_ms": round(first_interval_ms, 1),
         "cpu_ms_per_frame": round(1e3 * found.cpu_s / counted, 3),
-        "waited_for_cores": round(waited, 4),
+        "waited_for_cores": round(found.waited_s / (odometer.threads * found.all_s), 4),
         "memory_mib": memory_mib(),
         "environment": environment(odometer.threads),
     }
@@ -133,6 +133,7 @@ def _steps(
     found = _Found()
     spec = odometer.calibration.preprocess
     feeds = _blank_feeds(odometer)
+    all_begin, waited_s = perf_counter(), waited_for_cores_s()
     for count, frame in enumerate(islice(stream, warmup + frames)):
         image = preprocess.to_bgr8(frame.image)
         if image is not None:
@@ -150,6 +151,8 @@ def _steps(
             found.ratios.append(1e3 * spent_s / raw_ms)
             found.wall_s += spent_s + 1e-3 * frame.read_ms
             found.cpu_s += cpu_s
+    found.all_s = perf_counter() - all_begin
+    found.waited_s = waited_for_cores_s() - waited_s
     return found
 
 
@@ -163,6 +166,7 @@ def _streams(
     with closing(odometer.stream(stream)) as estimates:
         for _ in islice(estimates, warmup):
             pass
+        all_begin, waited_s = perf_counter(), waited_for_cores_s()
         for part in np.array_split(np.arange(frames), min(_ROUNDS, frames)):
             # What came while bare calls were timed, or lies ready since.
             lying = islice(estimates, odometer.threads + AHEAD)
@@ -184,6 +188,9 @@ def _streams(
             if ages_ms:
                 whole_ms = float(np.median(ages_ms)) if live else 1e3 * spent_s / len(ages_ms)
                 found.ratios.append(whole_ms / float(np.median(raw_ms)))
+        # Here, while the workers whose waiting counts are there.
+        found.all_s = perf_counter() - all_begin
+        found.waited_s = waited_for_cores_s() - waited_s
     return found
 
 

@@ -205,17 +205,27 @@ def bench(
 
 @app.command()
 def verify(bundle: BundleArgument, threads: ThreadsOption = None) -> None:
-    """Check every digest of a bundle, load it and run its self-test on this machine."""
-    from cvo_edge.artifact import read_bundle
+    """Check every digest of a bundle, load it and run its self-test on this machine.
+
+    Of the model as it is, and as the cache has it prepared, where it has.
+    """
+    from cvo_edge.artifact import Bundle, read_bundle
+    from cvo_edge.loading import PreparedBundle, found_in
     from cvo_edge.odometer import Odometer
+    from cvo_edge.prepared import ModelCache
     from cvo_edge.selftest import check_selftest
 
     content = read_bundle(bundle)
-    first = content.calibration.thresholds[0]
-    with Odometer(
-        content, threads=threads, confidence=first.confidence, scope=first.scope
-    ) as odometer:
-        worst = check_selftest(odometer)
+    forms: list[Bundle | PreparedBundle] = [content]
+    prepared = found_in(ModelCache.default(), content.calibration)
+    if prepared is not None:
+        forms.append(prepared)
+    first, worst = content.calibration.thresholds[0], 0.0
+    for form in forms:
+        with Odometer(
+            form, threads=threads, confidence=first.confidence, scope=first.scope
+        ) as odometer:
+            worst = max(worst, check_selftest(odometer))
     tolerance = content.calibration.selftest.tolerance
     print(
         f"{content.calibration.name}: digests match, model loads, self-test passed "
@@ -272,8 +282,12 @@ def cache(
 
     found = ModelCache.default()
     if clear:
+        obstacle = found.obstacle()
+        if obstacle is not None:
+            raise SinkError(f"{found.folder}: {obstacle}")
         removed = found.clear()
-        print(f"{found.folder}: {removed} removed")
+        report = {"folder": str(found.folder), "removed": removed}
+        print(json.dumps(report) if as_json else f"{found.folder}: {removed} removed")
         return
     if as_json:
         entries = [msgspec.to_builtins(entry) for entry in found.entries()]
@@ -363,13 +377,24 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
         code = 128 + signal.SIGINT
     except Terminated:
         code = 128 + signal.SIGTERM
-    except OSError as error:
-        # What the modules did not foresee: a path too long, standard output on a full disk.
-        failed = SourceError if error.filename else SinkError
-        where = error.filename or "standard output"
-        code = _complain(program, f"{where}: {error.strerror}", failed.exit_code)
-        _drop_stdout()
+    except Exception as error:
+        # A module in C that is being initialised makes an error of its own of what a signal raises.
+        if _terminated.is_set():
+            code = 128 + signal.SIGTERM
+        elif not isinstance(error, OSError):
+            raise
+        else:
+            code = _unforeseen(program, error)
     _leave(code)
+
+
+def _unforeseen(program: str, error: OSError) -> int:
+    """What the modules did not foresee: a path too long, standard output on a full disk."""
+    failed = SourceError if error.filename else SinkError
+    where = error.filename or "standard output"
+    code = _complain(program, f"{where}: {error.strerror}", failed.exit_code)
+    _drop_stdout()
+    return code
 
 
 def _leave(code: int) -> NoReturn:
@@ -404,7 +429,11 @@ class Terminated(SystemExit):
     """SIGTERM has come: what is open is to be closed, and the process to end."""
 
 
+_terminated = threading.Event()
+
+
 def _terminate(number: int, _: FrameType | None) -> NoReturn:
+    _terminated.set()
     raise Terminated(128 + number)
 
 

@@ -39,20 +39,28 @@ def load_bundle(folder: Path, cache: ModelCache) -> Bundle | PreparedBundle:
     has it, is not taken again.
     """
     calibration = read_calibration(folder)
-    if calibration.model.provider != "onnxruntime":
-        return read_bundle(folder)
-    prepared = cache.find(calibration.model.sha256)
-    if prepared is not None:
+    found = found_in(cache, calibration)
+    if found is not None:
         model = folder / MODEL_FILE
-        # What runs is the entry, whose digests were checked: this is for whoever swaps the file.
-        if not cache.knows(prepared, model):
+        # What runs is the entry, whose files were checked: this is for whoever swaps the model.
+        if not cache.knows(found.prepared, model):
             before = identity(model)
             check_model_file(folder, calibration)
-            cache.remember(prepared, model, before)
-        return PreparedBundle(calibration, prepared)
+            cache.remember(found.prepared, model, before)
+        return found
     bundle = read_bundle(folder)
+    if calibration.model.provider != "onnxruntime":
+        return bundle
     prepared = _prepared_now(bundle, cache)
     return bundle if prepared is None else PreparedBundle(bundle.calibration, prepared)
+
+
+def found_in(cache: ModelCache, calibration: Calibration) -> PreparedBundle | None:
+    """Return what the cache has of a calibration's model; of onnxruntime's alone it has any."""
+    if calibration.model.provider != "onnxruntime":
+        return None
+    prepared = cache.find(calibration.model.sha256)
+    return None if prepared is None else PreparedBundle(calibration, prepared)
 
 
 def _prepared_now(bundle: Bundle, cache: ModelCache) -> Prepared | None:

@@ -29,11 +29,12 @@ class OpenvinoSession(Session):
         self, model: bytes, threads: int | None, expected: ModelSpec, *, at_once: int = 1
     ) -> None:
         try:
-            import openvino
-        except ImportError:
+            from openvino import Core, Type
+        # Of an older release, or of what is left of one, whatever it happens to raise.
+        except Exception as error:
             raise ModelError(
-                "model.provider: expected the package openvino to be installed, found none; "
-                'pip install "cvo-edge[openvino]"'
+                "model.provider: expected the package openvino, 2026.4 or newer, found "
+                f'{one_line(error)}; pip install "cvo-edge[openvino]"'
             ) from None
         # It reads what a model names as external data, from whatever folder the process is in;
         # onnxruntime refuses such a model.
@@ -44,17 +45,17 @@ class OpenvinoSession(Session):
             "NUM_STREAMS": at_once,
             "INFERENCE_NUM_THREADS": self.threads * at_once,
             # Left to itself it computes in bfloat16 where the processor can.
-            "INFERENCE_PRECISION_HINT": openvino.Type.f32,
+            "INFERENCE_PRECISION_HINT": Type.f32,
         }
         try:
-            core = openvino.Core()
+            core = Core()
             self.engine = core.compile_model(core.read_model(model=model), "CPU", settings)
             precision = self.engine.get_property("INFERENCE_PRECISION_HINT")
         # Every failure is a RuntimeError there, of many lines; what it is about follows the places.
         except Exception as error:
             summary = str(error).rpartition("Summary:")[2]
             raise ModelError(f"model.onnx: refused by OpenVINO: {one_line(summary)}") from None
-        if precision != openvino.Type.f32:
+        if precision != Type.f32:
             raise ModelError(f"model.onnx: expected OpenVINO to compute in f32, found {precision}")
         self._declare(_ports(self.engine.inputs), _ports(self.engine.outputs), expected)
         self._requests = threading.local()

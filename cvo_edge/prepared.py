@@ -11,7 +11,9 @@ Nothing here may keep a model from running: what goes wrong with the cache costs
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
+import io
 import os
 import platform
 import re
@@ -41,6 +43,10 @@ _ENTRY_NAME = re.compile("[0-9a-f]{32}")
 _STALE_SECONDS = 3600.0
 # A file that changed less than this ago may change again without a sign: clocks tick slowly.
 _SETTLED_NS = 2_000_000_000
+# With these nothing is wrong with an entry: it may be read later.
+_PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EACCES)
+# Of what is kept, and of the settings it was made with; another one is another entry.
+_FORM = "2"
 # Copies of a bundle on one machine.
 _MOST_SEEN = 16
 
@@ -72,6 +78,7 @@ class Prepared:
 
     folder: Path
     graph: bytes
+    model_sha256: str
 
 
 class Listed(Struct, frozen=True):
@@ -126,21 +133,22 @@ class ModelCache:
             return None
         folder = self._entry_folder(model_sha256)
         try:
-            entry = msgspec.json.decode((folder / ENTRY_FILE).read_bytes(), type=Entry)
-            graph = (folder / GRAPH_FILE).read_bytes()
+            entry = msgspec.json.decode(_content(folder / ENTRY_FILE), type=Entry)
+            graph = _content(folder / GRAPH_FILE)
             unchanged = (
                 (entry.model_sha256, entry.onnxruntime, entry.processor)
                 == (model_sha256, _onnxruntime_version(), _processor())
                 and hashlib.sha256(graph).hexdigest() == entry.graph_sha256
                 and file_checksums(folder / WEIGHTS_FILE) == entry.weights_crc32
             )
-        except (FileNotFoundError, msgspec.DecodeError):
+        except msgspec.DecodeError:
             unchanged = False
-        except OSError:
-            # Too many open files, say: nothing is wrong with the entry.
-            return None
+        except OSError as error:
+            if error.errno in _PASSING:
+                return None
+            unchanged = False
         if unchanged:
-            return Prepared(folder, graph)
+            return Prepared(folder, graph, model_sha256)
         self.forget(model_sha256)
         return None
 
@@ -209,7 +217,10 @@ class ModelCache:
             entry = _read_entry(folder)
             if entry is None:
                 continue
-            size = sum(path.stat().st_size for path in folder.iterdir())
+            size = 0
+            # What another process has just removed has no size.
+            with contextlib.suppress(OSError):
+                size = sum(path.lstat().st_size for path in folder.iterdir())
             found.append(
                 Listed(
                     entry.name,
@@ -261,7 +272,7 @@ class ModelCache:
                 shutil.rmtree(path, ignore_errors=True)
 
     def _entry_folder(self, model_sha256: str) -> Path:
-        key = "\n".join((model_sha256, _onnxruntime_version(), _processor()))
+        key = "\n".join((_FORM, model_sha256, _onnxruntime_version(), _processor()))
         return self.folder / hashlib.sha256(key.encode()).hexdigest()[:32]
 
 
@@ -277,7 +288,7 @@ def _is_entry(folder: Path) -> bool:
 
 def _read_entry(folder: Path) -> Entry | None:
     try:
-        return msgspec.json.decode((folder / ENTRY_FILE).read_bytes(), type=Entry)
+        return msgspec.json.decode(_content(folder / ENTRY_FILE), type=Entry)
     except (OSError, msgspec.DecodeError):
         return None
 
@@ -297,10 +308,23 @@ def identity(path: Path) -> FileIdentity | None:
 
 def _seen(prepared: Prepared) -> list[FileIdentity]:
     try:
-        content = (prepared.folder / SEEN_FILE).read_bytes()
-        return msgspec.json.decode(content, type=list[FileIdentity])
+        return msgspec.json.decode(_content(prepared.folder / SEEN_FILE), type=list[FileIdentity])
     except (OSError, msgspec.DecodeError):
         return []
+
+
+def _opened(path: Path) -> io.FileIO:
+    """Open a regular file; neither links are followed nor pipes waited for."""
+    stream = io.FileIO(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK))
+    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+        stream.close()
+        raise FileNotFoundError(errno.ENOENT, "expected a regular file", str(path))
+    return stream
+
+
+def _content(path: Path) -> bytes:
+    with _opened(path) as stream:
+        return stream.read()
 
 
 def file_checksums(path: Path) -> list[int]:
@@ -309,7 +333,7 @@ def file_checksums(path: Path) -> list[int]:
     Against damage, as disks and memory cards do it. Whoever means harm and may write to the cache
     of this user could write the entry with its checksums, too.
     """
-    with path.open("rb", buffering=0) as stream:
+    with _opened(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         workers = os.cpu_count() or 1
 
@@ -328,7 +352,7 @@ def file_checksums(path: Path) -> list[int]:
 
 
 def _onnxruntime_version() -> str:
-    # Not at the top: a cache is listed and cleared without the engine. Asking the installed
+    # Not at the top: a cache is cleared without the engine. Asking the installed
     # package's metadata instead takes as long as opening a small model.
     from onnxruntime import __version__ as version
 

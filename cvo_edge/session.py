@@ -5,6 +5,7 @@ Bundles of another provider have their session in a file of its own, behind the 
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -242,11 +243,17 @@ class Session:
             return self.engine.run(None, feeds)  # type: ignore[no-any-return]
         # The calling thread is on the core that no other thread of ours has.
         before = os.sched_getaffinity(0)
-        os.sched_setaffinity(0, self._caller_core)
+        try:
+            os.sched_setaffinity(0, self._caller_core)
+        except OSError:
+            # Someone has taken the core away since.
+            self._caller_core = set()
         try:
             return self.engine.run(None, feeds)  # type: ignore[no-any-return]
         finally:
-            os.sched_setaffinity(0, before)
+            if self._caller_core:
+                with contextlib.suppress(OSError):
+                    os.sched_setaffinity(0, before)
 
 
 def _tensors(ports: Sequence[Port], kind: str) -> tuple[TensorSpec, ...]:

@@ -260,10 +260,10 @@ class Newest:
                 with self._changed:
                     self._changed.wait_for(lambda: self._frame or self._ended)
                     frame, skipped, self._skipped = self._frame, self._skipped, 0
-                    self._frame = None
+                    self._frame, ready_at = None, self._ready_at
                 if frame is None:
                     break
-                waited_ms = 1e3 * (perf_counter() - self._ready_at)
+                waited_ms = 1e3 * (perf_counter() - ready_at)
                 yield replace(frame, waited_ms=waited_ms, skipped=skipped)
         finally:
             self._closed = True

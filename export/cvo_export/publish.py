@@ -34,6 +34,7 @@ from cvo_export.to_onnx import OPSET, check_parity, export_onnx
 
 Array = NDArray[np.float64]
 
+_PACKAGES = ("cvo-edge", "cvo-export", "torch", "timm", "onnx", "onnxruntime", "numpy")
 _PARITY_FRAMES = 32
 # Frames that show how far the numbers of a feature map reach.
 _RANGE_FRAMES = 128
@@ -187,9 +188,7 @@ def _draft(
         ),
         selftest=blank_selftest(model.precision),
         provenance=artifact.Provenance(
-            created_with=versions(
-                ("cvo-edge", "cvo-export", "torch", "timm", "onnx", "onnxruntime", "numpy")
-            ),
+            created_with=versions((*_PACKAGES, provider)),
             seed=config.seed,
             backbone=config.backbone.name,
             weights_sha256=run.weights_sha256,

@@ -26,6 +26,8 @@ from onnxruntime.quantization import (
 )
 from onnxruntime.quantization.quant_utils import add_pre_process_metadata
 
+from cvo_edge.errors import UsageError
+
 Feed = Mapping[str, NDArray[np.generic]]
 
 # An activation behind a convolution becomes the range of its output, and costs nothing.
@@ -42,10 +44,19 @@ def quantised(content: bytes, feeds: Sequence[Feed]) -> bytes:
     The first convolution takes the image's own 8 bits, where the graph begins as our exporter
     writes it, and stays in float32 elsewhere: normalised pixels are not to be rounded once more.
     ``feeds`` are inputs by name, of frames that the ranges of the feature maps are taken from.
+    Raises UsageError for a backbone that has nothing to quantise.
     """
     model = onnx.shape_inference.infer_shapes(onnx.load_from_string(content))
     nodes = _backbone_nodes(model)
-    first = next(node for node in nodes if node.op_type == "Conv")
+    convolutions = [node for node in nodes if node.op_type == "Conv"]
+    constants = {constant.name for constant in model.graph.initializer}
+    computed = [node.name for node in convolutions if node.input[1] not in constants]
+    if not convolutions or computed:
+        raise UsageError(
+            "precision int8: expected a backbone of convolutions with constant weights, found "
+            + (f"those of {computed[0]} computed" if computed else "none")
+        )
+    first = convolutions[0]
     zero = _fold_normalisation(model, first)
     chosen = [node for node in nodes if zero is not None or node is not first]
     _correct_biases(model, [node for node in chosen if node.op_type == "Conv"], feeds)

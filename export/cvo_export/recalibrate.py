@@ -49,6 +49,7 @@ GivenRotation = Literal["tangent_predicted", "euler_zyx"]
 _FORMS = ({"pose": (1, 7)}, {"pose": (1, 7), "lower": (1, 6), "upper": (1, 6)})
 _FULL_TURN = float(np.pi)
 _LEAST_INPUT = 16
+_PACKAGES = ("cvo-edge", "cvo-export", "onnx", "onnxruntime", "numpy")
 # Of the raps score, where a bundle has none of its own.
 _PENALTY, _FREE_RANKS = 0.01, 5
 
@@ -117,7 +118,14 @@ def recalibrate(
         draft.calibration, rule=rule, joint=joint, split=split.spec(dataset), dataset=dataset.name
     )
     own = provider or draft.model.provider
-    draft = replace(draft, name=name, calibration=source, model=replace(draft.model, provider=own))
+    made = {**draft.provenance.created_with, **versions((*_PACKAGES, own))}
+    draft = replace(
+        draft,
+        name=name,
+        calibration=source,
+        model=replace(draft.model, provider=own),
+        provenance=replace(draft.provenance, created_with=made),
+    )
     chosen_from = selected(candidates, score, sides)
     calibration = calibrated(draft, model_bytes, dataset, split.roles, chosen_from)
     return write_bundle(bundle_dir, calibration, model_bytes)
@@ -243,7 +251,7 @@ def _from_model(
         ),
         selftest=blank_selftest(spec.precision),
         provenance=artifact.Provenance(
-            created_with=versions(("cvo-edge", "cvo-export", "onnx", "onnxruntime", "numpy")),
+            created_with=versions(_PACKAGES),
             seed=split.seed,
             backbone=None,
             weights_sha256=None,

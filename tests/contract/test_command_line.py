@@ -96,6 +96,19 @@ def test_a_reader_that_leaves_ends_it_quietly(bundle_dir, clip_dir):
         assert process.wait(60) == 0
 
 
+@pytest.mark.parametrize("delay_s", [0.1, 0.2, 0.25, 0.3, 0.35, 0.5])
+def test_a_signal_while_it_starts_is_no_defect(bundle_dir, delay_s):
+    """Modules that are being initialised turn what a signal raises into errors of their own."""
+    command = [*FOREGROUND, "bench", str(bundle_dir), "--frames", "1000000"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        time.sleep(delay_s)
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=60)
+    # Before the first line of ours Python ends as it does without us.
+    assert process.returncode in (143, -signal.SIGTERM)
+    assert said == ""
+
+
 @pytest.mark.parametrize("mode", ["latency", "throughput", "live"])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_it_with_every_record_whole(

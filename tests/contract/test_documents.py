@@ -1,5 +1,6 @@
 """Figures in the documents are those that the programs of ``bench`` wrote."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,14 @@ def printed(program: str) -> str:
 def tables(text: str) -> list[str]:
     blocks = "\n".join(line if line.startswith("|") else "" for line in text.splitlines())
     return [block for block in blocks.split("\n\n") if block.strip()]
+
+
+def test_every_program_has_its_results_and_no_figure_is_left_open() -> None:
+    found = {path.stem for path in (ROOT / "bench" / "results" / "speed").glob("*.json")}
+    programs = ("frame", "stream", "start", "scaling", "peers", "uncertainty_peers", "soak")
+    assert found == set(programs)
+    for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")):
+        assert not re.search(r"@[A-Z]+@", page.read_text("utf-8")), page
 
 
 def test_the_readme_has_the_goals_as_measured() -> None:

@@ -10,6 +10,7 @@ import sys
 import zlib
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -71,6 +72,56 @@ def test_a_changed_byte_is_never_used(file, bundle_dir, bundle, cache):
     assert not path.exists()
     assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
     assert cache.find(sha256) is not None
+
+
+def make_folder(path: Path) -> None:
+    path.mkdir()
+
+
+def make_dangling_link(path: Path) -> None:
+    path.symlink_to("/nonexistent")
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, make_folder, make_dangling_link])
+@pytest.mark.parametrize("file", [GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE, SEEN_FILE])
+def test_what_is_no_file_is_neither_waited_for_nor_followed(file, make, bundle_dir, bundle, cache):
+    load_bundle(bundle_dir, cache)
+    path = entry_folder(cache) / file
+    path.unlink(missing_ok=True)
+    make(path)
+    cache_lines(cache)
+    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+    assert cache.find(bundle.calibration.model.sha256) is not None
+
+
+def test_what_is_prepared_is_of_this_model_and_this_engine(bundle_dir, bundle, cache):
+    """Of two bundles that agree in every name and shape none runs with the other's model."""
+    prepared = load_bundle(bundle_dir, cache).prepared
+    eight = read_bundle(bundle_dir.with_name("synthetic-room-cjp-int8")).calibration
+    elsewhere = msgspec.structs.replace(
+        bundle.calibration,
+        model=msgspec.structs.replace(bundle.calibration.model, provider="openvino"),
+    )
+    for calibration in (eight, elsewhere):
+        with pytest.raises(BundleMismatchError, match="prepared model: expected"):
+            Odometer(PreparedBundle(calibration, prepared))
+
+
+def test_verify_asks_the_prepared_model_too(bundle_dir, cache, monkeypatch):
+    """An entry that was written with other weights, its checksums made to fit."""
+    load_bundle(bundle_dir, cache)
+    monkeypatch.setenv("CVO_EDGE_CACHE", str(cache.folder))
+    command = [*CVO_EDGE, "verify", str(bundle_dir)]
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 0
+    weights = entry_folder(cache) / WEIGHTS_FILE
+    values = np.fromfile(weights, np.float32)
+    (values * 1.5).tofile(weights)
+    entry = json.loads((entry_folder(cache) / ENTRY_FILE).read_bytes())
+    entry["weights_crc32"] = file_checksums(weights)
+    (entry_folder(cache) / ENTRY_FILE).write_text(json.dumps(entry))
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 8
+    assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize("file", [GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE])

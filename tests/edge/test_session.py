@@ -10,8 +10,9 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from cvo_edge import session
+from cvo_edge import preprocess, session
 from cvo_edge.errors import ModelError
+from cvo_edge.odometer import Odometer
 from cvo_edge.session import allowed_cores, cgroup_cores
 
 
@@ -88,6 +89,19 @@ def test_a_callers_thread_is_where_it_was_after_an_inference(bundle, spinning):
     with pytest.raises(ModelError):
         loaded.run({"picture": image})
     assert os.sched_getaffinity(0) == cores
+
+
+def test_a_core_that_is_taken_away_costs_the_pinning_alone(bundle):
+    with Odometer(bundle, threads=1) as odometer:
+        image = preprocess.selftest_image(192, 256)
+        expected = odometer.observe(image, 0)
+        # As if a control group had lost it since.
+        odometer.session._caller_core = {1023}
+        before = os.sched_getaffinity(0)
+        for _ in range(2):
+            found = odometer.observe(image, 0)
+            assert np.array_equal(found.pose, expected.pose)
+        assert os.sched_getaffinity(0) == before
 
 
 def test_sums_of_8_bit_products_are_exact_as_a_session_is_set_up():

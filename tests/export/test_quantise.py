@@ -12,6 +12,7 @@ from torch import nn
 from cvo_edge import session
 from cvo_edge.artifact import read_bundle
 from cvo_edge.conformal import conformal_quantile
+from cvo_edge.errors import UsageError
 from cvo_edge.odometer import Odometer
 from cvo_edge.selftest import check_selftest
 from cvo_edge.session import Session
@@ -165,3 +166,18 @@ def test_the_runtimes_question_to_the_processor_is_this_product():
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
     model.ClearField("producer_name")
     assert onnx.load_from_string(session._PRODUCT) == model
+
+
+def test_a_backbone_without_constant_weights_is_refused_in_one_line():
+    x = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3, 8, 8])
+    y = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, 4, 1, 1])
+    w = numpy_helper.from_array(np.ones((4, 3, 3, 3), np.float32), "w")
+    nodes = [
+        helper.make_node("Relu", ["w"], ["computed"]),
+        helper.make_node("Conv", ["x", "computed"], ["maps"], name="standardised"),
+        helper.make_node("GlobalAveragePool", ["maps"], ["y"]),
+    ]
+    graph = helper.make_graph(nodes, "g", [x], [y], [w])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    with pytest.raises(UsageError, match=r"expected .* standardised computed"):
+        quantised(model.SerializeToString(), [{"x": np.zeros((1, 3, 8, 8), np.float32)}])
