@@ -18,6 +18,7 @@ from frame import measured
 from networks import ROOM, WORK, demonstration, images
 from rounds import figures, write_report
 
+from cvo_edge.artifact import CONFIDENCES as LEVELS
 from cvo_edge.artifact import encode_calibration, read_bundle, read_calibration
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import Scope
@@ -27,7 +28,7 @@ from cvo_export.train import train
 
 ROUNDS = 100
 SIZES = ("128x96", "256x192", "384x288", "512x384")
-CONFIDENCES = (1, 10, 50)
+CONFIDENCES = (5, 10, 50)
 # Method -> its option, values, and what the option decides.
 OPTIONS: dict[str, tuple[str, tuple[int, ...]]] = {
     "mcqr": ("rays", (5, 21, 85, 192)),
@@ -71,15 +72,17 @@ def one(folder: Path, scope: Scope = "marginal") -> dict[str, Any]:
 
 
 def confidences(count: int) -> dict[str, Any]:
-    """Time loading and sets where the bundle stores so many confidences, and all are asked for."""
+    """Time reading a bundle of so many confidences, and all their sets of both scopes."""
     source = demonstration("cjp")
     content = read_bundle(source)
-    stored = [t for t in content.calibration.thresholds if t.scope == "marginal"]
-    levels = np.linspace(0.5, 0.95, count) if count > 1 else np.array([0.9])
-    thresholds = tuple(
-        msgspec.structs.replace(stored[0], confidence=round(float(level), 4)) for level in levels
-    )
-    calibration = msgspec.structs.replace(content.calibration, thresholds=thresholds)
+    stored = list(content.calibration.thresholds)
+    # Beside those that every bundle has; a larger confidence never has a smaller threshold.
+    for scope in ("marginal", "joint"):
+        least = min((t for t in stored if t.scope == scope), key=lambda t: t.confidence)
+        levels = np.linspace(0.51, 0.79, count - len(LEVELS)).round(4).tolist()
+        stored += [msgspec.structs.replace(least, confidence=level) for level in levels]
+    stored.sort(key=lambda t: (t.confidence, t.scope))
+    calibration = msgspec.structs.replace(content.calibration, thresholds=tuple(stored))
     folder = WORK / "scaling" / f"confidences-{count}"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "calibration.json").write_bytes(encode_calibration(calibration))
