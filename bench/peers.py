@@ -288,7 +288,9 @@ def measured(backbone: str, peers: dict[str, Peer]) -> dict[str, Any]:
 def line(name: str, row: dict[str, Any]) -> str:
     """Return one engine's figures as text."""
     start = f"  {name:<34} {row['precision']:<5}"
-    difference = f"difference {row.get('largest_difference', 0.0):.1e}"
+    difference = "ours"
+    if "largest_difference" in row:
+        difference = f"difference {row['largest_difference']:.1e}"
     if "ms" not in row:
         return f"{start} not timed: other numbers than ours, {difference}"
     return (

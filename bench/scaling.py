@@ -26,7 +26,7 @@ from cvo_export.configure import configure
 from cvo_export.publish import publish
 from cvo_export.train import train
 
-ROUNDS = 100
+ROUNDS = 99
 SIZES = ("128x96", "256x192", "384x288", "512x384")
 CONFIDENCES = (5, 10, 50)
 # Method -> its option, values, and what the option decides.
