@@ -21,7 +21,6 @@ import shutil
 import stat
 import tempfile
 import time
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +45,7 @@ _SETTLED_NS = 2_000_000_000
 # With these nothing is wrong with an entry: it may be read later.
 _PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EACCES)
 # Of what is kept, and of the settings it was made with; another one is another entry.
-_FORM = "2"
+_FORM = "3"
 # Copies of a bundle on one machine.
 _MOST_SEEN = 16
 
@@ -59,7 +58,7 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True):
     onnxruntime: str
     processor: str
     graph_sha256: str
-    weights_crc32: list[int]
+    weights_sha256: list[str]
 
 
 class FileIdentity(Struct, frozen=True, array_like=True):
@@ -139,7 +138,7 @@ class ModelCache:
                 (entry.model_sha256, entry.onnxruntime, entry.processor)
                 == (model_sha256, _onnxruntime_version(), _processor())
                 and hashlib.sha256(graph).hexdigest() == entry.graph_sha256
-                and file_checksums(folder / WEIGHTS_FILE) == entry.weights_crc32
+                and file_digests(folder / WEIGHTS_FILE) == entry.weights_sha256
             )
         except msgspec.DecodeError:
             unchanged = False
@@ -192,7 +191,7 @@ class ModelCache:
                 onnxruntime=_onnxruntime_version(),
                 processor=_processor(),
                 graph_sha256=hashlib.sha256((new / GRAPH_FILE).read_bytes()).hexdigest(),
-                weights_crc32=file_checksums(new / WEIGHTS_FILE),
+                weights_sha256=file_digests(new / WEIGHTS_FILE),
             )
             (new / ENTRY_FILE).write_bytes(msgspec.json.encode(entry))
             # Whole or not at all; a folder that is there and not empty is left as it is.
@@ -327,26 +326,24 @@ def _content(path: Path) -> bytes:
         return stream.read()
 
 
-def file_checksums(path: Path) -> list[int]:
-    """CRC-32 of each MiB of a file, by all cores beside each other; raises OSError.
-
-    Against damage, as disks and memory cards do it. Whoever means harm and may write to the cache
-    of this user could write the entry with its checksums, too.
-    """
+def file_digests(path: Path) -> list[str]:
+    """Sha256 of each MiB of a file, by all cores beside each other; raises OSError."""
     with _opened(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         workers = os.cpu_count() or 1
 
-        def checked(first: int) -> dict[int, int]:
+        def digests(first: int) -> dict[int, str]:
             buffer = memoryview(bytearray(_CHUNK_BYTES))
             return {
-                offset: zlib.crc32(buffer[: os.preadv(stream.fileno(), [buffer], offset)])
+                offset: hashlib.sha256(
+                    buffer[: os.preadv(stream.fileno(), [buffer], offset)]
+                ).hexdigest()
                 for offset in range(first * _CHUNK_BYTES, size, workers * _CHUNK_BYTES)
             }
 
-        found: dict[int, int] = {}
+        found: dict[int, str] = {}
         with ThreadPoolExecutor(workers) as pool:
-            for part in pool.map(checked, range(workers)):
+            for part in pool.map(digests, range(workers)):
                 found |= part
     return [found[offset] for offset in sorted(found)]
 

@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 import time
-import zlib
 from pathlib import Path
 
 import msgspec
@@ -26,7 +25,7 @@ from cvo_edge.prepared import (
     SEEN_FILE,
     WEIGHTS_FILE,
     ModelCache,
-    file_checksums,
+    file_digests,
 )
 from cvo_edge.selftest import check_selftest
 from cvo_edge.sources import open_source
@@ -109,7 +108,7 @@ def test_what_is_prepared_is_of_this_model_and_this_engine(bundle_dir, bundle, c
 
 
 def test_verify_asks_the_prepared_model_too(bundle_dir, cache, monkeypatch):
-    """An entry that was written with other weights, its checksums made to fit."""
+    """An entry that was written with other weights, its digests made to fit."""
     load_bundle(bundle_dir, cache)
     monkeypatch.setenv("CVO_EDGE_CACHE", str(cache.folder))
     command = [*CVO_EDGE, "verify", str(bundle_dir)]
@@ -118,7 +117,7 @@ def test_verify_asks_the_prepared_model_too(bundle_dir, cache, monkeypatch):
     values = np.fromfile(weights, np.float32)
     (values * 1.5).tofile(weights)
     entry = json.loads((entry_folder(cache) / ENTRY_FILE).read_bytes())
-    entry["weights_crc32"] = file_checksums(weights)
+    entry["weights_sha256"] = file_digests(weights)
     (entry_folder(cache) / ENTRY_FILE).write_text(json.dumps(entry))
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 8
@@ -287,7 +286,7 @@ def test_a_damaged_entry_can_be_cleared(bundle_dir, cache):
 def test_an_entry_that_cannot_be_read_now_is_kept(bundle_dir, bundle, cache, monkeypatch):
     load_bundle(bundle_dir, cache)
     with monkeypatch.context() as patch:
-        patch.setattr("cvo_edge.prepared.file_checksums", too_many_open_files)
+        patch.setattr("cvo_edge.prepared.file_digests", too_many_open_files)
         assert isinstance(load_bundle(bundle_dir, cache), Bundle)
     assert cache.find(bundle.calibration.model.sha256) is not None
 
@@ -341,27 +340,27 @@ def test_the_folder_is_named_by_the_environment(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("size", [0, 1, (1 << 20) - 1, 1 << 20, (1 << 20) + 1, 5 << 20])
-def test_a_files_checksums_depend_on_every_byte_and_the_length(size, tmp_path):
+def test_a_files_digests_depend_on_every_byte_and_the_length(size, tmp_path):
     path = tmp_path / "file"
     path.write_bytes(bytes(size))
-    found = {tuple(file_checksums(path))}
+    found = {tuple(file_digests(path))}
     path.write_bytes(bytes(size + 1))
-    found.add(tuple(file_checksums(path)))
+    found.add(tuple(file_digests(path)))
     places = {0, size // 2, size}
     for place in places:
         changed = bytearray(size + 1)
         changed[place] = 1
         path.write_bytes(changed)
-        found.add(tuple(file_checksums(path)))
+        found.add(tuple(file_digests(path)))
     assert len(found) == 2 + len(places)
 
 
-def test_a_files_checksums_are_those_of_its_parts(tmp_path):
+def test_a_files_digests_are_those_of_its_parts(tmp_path):
     content = np.random.default_rng(0).bytes((5 << 19) + 3)
     path = tmp_path / "file"
     path.write_bytes(content)
     parts = [content[start : start + (1 << 20)] for start in range(0, len(content), 1 << 20)]
-    assert file_checksums(path) == [zlib.crc32(part) for part in parts]
+    assert file_digests(path) == [hashlib.sha256(part).hexdigest() for part in parts]
 
 
 def test_a_bundle_without_a_cache_is_read_as_before(bundle_dir):
