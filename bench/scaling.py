@@ -11,6 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+from unittest.mock import patch
 
 import msgspec
 import numpy as np
@@ -23,6 +24,8 @@ from cvo_edge.artifact import encode_calibration, read_bundle, read_calibration
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import Scope
 from cvo_export.configure import configure
+from cvo_export.directional import Choice, RegionNetwork
+from cvo_export.heads import mcqr
 from cvo_export.publish import publish
 from cvo_export.train import train
 
@@ -59,9 +62,16 @@ def bundle(method: str, size: str = "256x192", **head: int) -> Path:
             copies=0,
         )
         features = WORK / "features"
-        run = train(WORK / "runs" / name, config, lambda *_: None, features)
+        # One ellipsoid is enough for val here: what more of them cost is the question.
+        with patch.object(mcqr, "thrifty_choice", whole_codebook):
+            run = train(WORK / "runs" / name, config, lambda *_: None, features)
         publish(run, folder, name)
     return folder
+
+
+def whole_codebook(network: RegionNetwork, *_: object) -> Choice:
+    """Every point of the codebook, at its inflation as learned; arguments as ``thrifty_choice``."""
+    return Choice(1.0, np.arange(len(network.shells)))
 
 
 def one(folder: Path, scope: Scope = "marginal") -> dict[str, Any]:
