@@ -266,8 +266,12 @@ def _call(python: Path, *arguments: str | Path) -> subprocess.CompletedProcess[s
 
 
 def _environment() -> dict[str, str]:
-    """As it is here, but that only the project's own code is found besides a Python's packages."""
-    return {**os.environ, "PYTHONPATH": str(ROOT)}
+    """As it is here, but that only the project's own code is found besides a Python's packages.
+
+    Nor models that this machine has prepared: an emulated processor is known by its flags.
+    """
+    own = {"PYTHONPATH": str(ROOT), "CVO_EDGE_CACHE": str(FOLDER / "models")}
+    return {**os.environ, **own}
 
 
 if __name__ == "__main__":
