@@ -43,9 +43,6 @@ from cvo_edge.trajectory import MATRIX_SUFFIX, read_pose_matrix
 
 CONFIDENCE = 0.9
 
-# Those of the runtime alone that depend on the processor; other contracts need onnx, too.
-TESTS = ("tests/edge", "tests/contract/test_demonstrations.py")
-
 # In the joint scope sets differ from the others in their thresholds alone: the first fifth of the
 # frames will do, as an emulated inference takes a second.
 JOINT_SHARE = 5
@@ -121,11 +118,11 @@ def run_tests(board: Board, python: Path) -> dict[str, int]:
     """Run the runtime's tests on the board, seen as they run -> how many had which outcome."""
     report = FOLDER / f"{board.name}-tests.xml"
     report.unlink(missing_ok=True)
-    print(f"tests: {', '.join(TESTS)}; left out: those marked whole_clip", flush=True)
+    print(f"tests: {', '.join(board.tests)}; left out: those marked whole_clip", flush=True)
     marks = ("-m", "not whole_clip", f"--junitxml={report}")
     parallel = ("-n", str(allowed_cores()), "--dist=load")
     command: list[str | Path] = [python, "-m", "pytest", "-q"]
-    command += [*parallel, *marks, "--timeout=1800", *TESTS]
+    command += [*parallel, *marks, "--timeout=1800", *board.tests]
     code = subprocess.run(command, cwd=ROOT, env=_environment(), check=False).returncode
     if not report.is_file():
         return {"passed": 0, "skipped": 0, "failed": 1}
@@ -151,7 +148,8 @@ def examine(
     print(f"{board.name}: {said}", flush=True)
     count = len(list(frames.glob("*" + MATRIX_SUFFIX)))
     scopes: dict[str, Any] = {}
-    for scope, limit in (("marginal", count), ("joint", max(1, count // JOINT_SHARE))):
+    limits = {"marginal": count, "joint": max(1, count // JOINT_SHARE)}
+    for scope, limit in limits.items() if precision in board.compared else ():
         options = (f"--scope={scope}", f"--max-frames={limit}")
         here, there = (
             _records(each, f"{on}-{calibration.name}-{scope}", folder, frames, options)

@@ -20,6 +20,8 @@ from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
+from cvo_edge.artifact import Precision
+
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / ".boards"
 
@@ -59,6 +61,10 @@ class Board:
         qemu's program, and its name of the processor.
     saturates
         Whether 8-bit products saturate there, unless onnxruntime is told otherwise.
+    tests
+        Those of the runtime alone that are run there; other contracts need onnx, too.
+    compared
+        Precisions whose records are compared; the others' self-tests are run alone.
     """
 
     name: str
@@ -66,7 +72,11 @@ class Board:
     emulator: str
     cpu: str
     saturates: bool
+    tests: tuple[str, ...]
+    compared: tuple[Precision, ...]
 
+
+_WITHOUT_NETWORKS = ("conformal", "geometry", "heads", "pose", "preprocess", "trajectory")
 
 BOARDS = {
     board.name: board
@@ -77,6 +87,8 @@ BOARDS = {
             "qemu-aarch64-static",
             "cortex-a72",
             saturates=False,
+            tests=("tests/edge", "tests/contract/test_demonstrations.py"),
+            compared=("fp32", "int8"),
         ),
         Board(
             "avx2",
@@ -85,6 +97,9 @@ BOARDS = {
             # Without the features that the emulator would say on stderr it has not.
             "Haswell-noTSX,-pcid,-x2apic,-tsc-deadline,-invpcid",
             saturates=True,
+            # In float32 a frame takes that emulator 18 seconds, in 8 bits one.
+            tests=tuple(f"tests/edge/test_{name}.py" for name in _WITHOUT_NETWORKS),
+            compared=("int8",),
         ),
     )
 }
