@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import preprocess
-from cvo_edge.artifact import Bundle, Calibration, Threshold, read_bundle
-from cvo_edge.errors import BundleMismatchError, CalibrationFileError, ModelError, UsageError
-from cvo_edge.heads import HEADS, Head
+from cvo_edge.artifact import Bundle, Threshold, read_bundle
+from cvo_edge.consistency import check_consistency
+from cvo_edge.errors import CalibrationFileError, ModelError, UsageError
+from cvo_edge.heads import HEADS
 from cvo_edge.loading import PreparedBundle, load_bundle
 from cvo_edge.modes import Mode, checked_mode, in_order, plan
 from cvo_edge.pose import (
@@ -115,7 +116,7 @@ class Odometer:
         self.scope = scope
         self.threshold = self._stored_threshold(confidence, scope)
         self.head = HEADS[calibration.method](calibration)
-        _check_tensors(calibration, self.head)
+        check_consistency(calibration, self.head)
         model = bundle.model_bytes if isinstance(bundle, Bundle) else bundle.prepared
         self.mode = checked_mode(mode)
         settings = plan(self.mode, threads)
@@ -372,21 +373,6 @@ class Odometer:
         if self.chart.rotation == "euler_zyx" and abs(observation.point[4]) > _STEEP_PITCH:
             remarks += (Reason.PITCH_NEAR_90,)
         return remarks
-
-
-def _check_tensors(calibration: Calibration, head: Head) -> None:
-    """Refuse a bundle whose model does not have the tensors that its method works with."""
-    image = {spec.name: spec.shape for spec in calibration.model.inputs if spec.name == "image"}
-    extra = {name: values.shape for name, values in head.extra_inputs(0).items()}
-    for kind, needed, specs in (
-        ("inputs", {**image, **extra}, calibration.model.inputs),
-        ("outputs", dict(head.outputs), calibration.model.outputs),
-    ):
-        found = {spec.name: spec.shape for spec in specs}
-        if found != needed:
-            raise BundleMismatchError(
-                f"model.{kind}: expected {needed} for method {calibration.method}, found {found}"
-            )
 
 
 def _all_finite(output: NDArray[np.float32]) -> bool:

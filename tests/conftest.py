@@ -39,6 +39,11 @@ def bundle_dir() -> Path:
 
 
 @pytest.fixture(scope="session")
+def artifacts_dir() -> Path:
+    return ARTIFACTS
+
+
+@pytest.fixture(scope="session")
 def clip_dir() -> Path:
     return ARTIFACTS / "synthetic-room-clip"
 

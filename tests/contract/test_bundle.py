@@ -3,7 +3,9 @@
 import hashlib
 import json
 import os
+import shutil
 import time
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -150,6 +152,53 @@ def test_tensors_that_the_method_does_not_work_with_are_refused_at_load(
     (copied_bundle / "calibration.json").write_bytes(redigested(wrong))
     with pytest.raises(BundleMismatchError, match=r"model\.(inputs|outputs): expected"):
         Odometer.load(copied_bundle)
+
+
+def with_joint_at(document, confidence, values):
+    """The document with these q_hat of the joint scope at this confidence and below."""
+    copy = json.loads(json.dumps(document))
+    for entry in copy["thresholds"]:
+        if entry["scope"] == "joint" and entry["confidence"] <= confidence:
+            entry["q_hat"] = values
+            entry["q_hat_upper"] = values if entry["q_hat_upper"] else None
+    return copy
+
+
+def marginal_at(document, confidence):
+    return next(
+        entry["q_hat"]
+        for entry in document["thresholds"]
+        if entry["scope"] == "marginal" and entry["confidence"] == confidence
+    )
+
+
+@pytest.mark.parametrize("method", ["cjp", "cqr", "csp"])
+def test_a_joint_threshold_smaller_than_it_can_be_is_refused(tmp_path, artifacts_dir, method):
+    folder = Path(shutil.copytree(artifacts_dir / f"synthetic-room-{method}", tmp_path / method))
+    document = json.loads((folder / "calibration.json").read_bytes())
+    least = marginal_at(document, 0.5)
+    (folder / "calibration.json").write_bytes(redigested(with_joint_at(document, 0.5, least)))
+    Odometer.load(folder).close()
+    smaller = [*least[:5], least[5] - 1e-6]
+    (folder / "calibration.json").write_bytes(redigested(with_joint_at(document, 0.5, smaller)))
+    with pytest.raises(CalibrationFileError, match=r"scope joint at 0\.5 at least .* at \[5\]"):
+        Odometer.load(folder)
+
+
+def test_of_two_sides_each_has_half_of_what_the_joint_scope_may_miss(tmp_path, artifacts_dir):
+    folder = Path(shutil.copytree(artifacts_dir / "synthetic-room-cqr", tmp_path / "cqr"))
+    document = json.loads((folder / "calibration.json").read_bytes())
+    document["method_parameters"]["sides"] = "asymmetric"
+    for entry in document["thresholds"]:
+        entry["q_hat_upper"] = entry["q_hat"]
+    # A side at 0.8 holds with 0.9, as each of them does in a joint scope at 0.9.
+    least = marginal_at(document, 0.8)
+    (folder / "calibration.json").write_bytes(redigested(with_joint_at(document, 0.9, least)))
+    Odometer.load(folder).close()
+    smaller = [least[0] - 1e-6, *least[1:]]
+    (folder / "calibration.json").write_bytes(redigested(with_joint_at(document, 0.9, smaller)))
+    with pytest.raises(CalibrationFileError, match=r"joint at 0\.9 at least .* marginal at 0\.8"):
+        Odometer.load(folder)
 
 
 def test_a_confidence_stored_twice_is_refused(document):
