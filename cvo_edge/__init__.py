@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from cvo_edge.odometer import Odometer
     from cvo_edge.pose import Chart, ConformalSet, Ellipsoids, Pose, PoseInterval, Reason, Status
     from cvo_edge.prepared import ModelCache
+    from cvo_edge.records import Record, read_records
     from cvo_edge.sources import Frame, open_source
 
 __version__ = "0.1.0"
@@ -48,12 +49,14 @@ __all__ = [
     "Pose",
     "PoseInterval",
     "Reason",
+    "Record",
     "SinkError",
     "SourceError",
     "Status",
     "UsageError",
     "open_source",
     "read_bundle",
+    "read_records",
 ]
 
 _HOMES = {
@@ -73,12 +76,14 @@ _HOMES = {
     "Pose": "pose",
     "PoseInterval": "pose",
     "Reason": "pose",
+    "Record": "records",
     "SinkError": "errors",
     "SourceError": "errors",
     "Status": "pose",
     "UsageError": "errors",
     "open_source": "sources",
     "read_bundle": "artifact",
+    "read_records": "records",
 }
 
 
