@@ -42,7 +42,11 @@ demo-%: $(DEMO_VENV)/.installed
 	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE)-$* $(CLIP) --format table --max-frames 4 --quiet
 	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE)-$* $(CLIP) --ground-truth $(CLIP) --output demo-$*.jsonl
 
-test: $(VENV)/.installed
+# Another release of OpenCV, for the tests that compare what both make of the same files.
+.opencv4: $(VENV)/.installed
+	$(VENV)/bin/python -m pip install --quiet --no-deps --target $@ opencv-python-headless==4.10.0.84
+
+test: $(VENV)/.installed .opencv4
 	$(VENV)/bin/python -m pytest
 
 arm64 avx2: $(VENV)/.installed
@@ -74,4 +78,4 @@ format: $(VENV)/.installed
 	$(VENV)/bin/ruff format .
 
 clean:
-	rm -rf $(VENV) $(DEMO_VENV) .boards build/bench $(addprefix demo-,$(METHODS:=.jsonl))
+	rm -rf $(VENV) $(DEMO_VENV) .opencv4 .boards build/bench $(addprefix demo-,$(METHODS:=.jsonl))

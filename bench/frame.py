@@ -33,11 +33,11 @@ from rounds import Array, figures, interleaved, ratio, write_report
 
 from cvo_edge import preprocess
 from cvo_edge.artifact import Bundle, read_bundle
+from cvo_edge.images import decode_image
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import Scope
 from cvo_edge.session import Session
 from cvo_edge.sinks import Sink
-from cvo_edge.sources import decode_image
 
 THREADS, ROUNDS, WARM_UP, BLOCKS = 2, 150, 20, 3
 PAIRS = (("record", "raw"), ("step", "pose_alone"), ("step", "raw"))

@@ -17,8 +17,8 @@ import numpy as np
 from networks import METHODS, demonstration, frames, images
 
 from cvo_edge import preprocess
+from cvo_edge.images import decode_image
 from cvo_edge.odometer import Odometer
-from cvo_edge.sources import decode_image
 
 THREADS, ROUNDS, WARM_UP = 2, 300, 50
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.images import decode_image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 
@@ -28,8 +29,6 @@ _PATIENCE_S = 2.0
 LOWEST_FPS, HIGHEST_FPS = 1e-3, 1e6
 
 READER = "cvo-edge reader"
-
-_JPEG_END = b"\xff\xd9"
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,24 +113,6 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
         for index, part in enumerate(parts)
         if part
     ]
-
-
-def decode_image(content: bytes) -> NDArray[np.uint8] | None:
-    """Bytes of an image file -> (height, width, 3) uint8 BGR, or None where it is not whole.
-
-    The camera's own pixel order is kept (no EXIF rotation). Some OpenCV versions decode a cut JPEG
-    to a full-size wrong picture, so its end marker is looked for first.
-    """
-    if not content:
-        return None
-    if content.startswith(b"\xff\xd8") and _JPEG_END not in content[-1024:]:
-        return None
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
-    except cv2.error:
-        return None
-    return None if image is None else np.asarray(image, dtype=np.uint8)
 
 
 class ImageFiles:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.sources import Video, decode_image, open_source
+from cvo_edge.images import decode_image
+from cvo_edge.sources import Video, open_source
 
 
 def picture(value=0, height=48, width=64):

@@ -1,0 +1,138 @@
+"""Bytes of an image file -> pixels, where they are whole, of bearable size, and of known meaning.
+
+A decoder believes its header: 100 kB of PNG may ask for gigabytes. So the size is read first, by
+ourselves, as OpenCV can only be told a limit by the environment, before it is imported.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+# As BGR 192 MiB; an 8K camera has half of it.
+MAX_PIXELS = 1 << 26
+
+_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+_JPEG_END = b"\xff\xd9"
+_PNM = re.compile(rb"P[1-6](?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})(?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})\s")
+_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+# TIFF's 16 and 32 bit unsigned numbers.
+_TIFF_NUMBERS = {3: "H", 4: "I"}
+
+
+def decode_image(content: bytes) -> NDArray[np.uint8] | None:
+    """Bytes of an image file -> (height, width, 3) uint8 BGR, or None where that cannot be had.
+
+    JPEG, PNG, BMP, PNM, TIFF and WebP, known by their first bytes. Grey is repeated, alpha dropped,
+    16 bits keep their upper eight, and the camera's own pixel order is kept (no EXIF rotation).
+    None where the header is none of these or asks for more than ``MAX_PIXELS``, and where the file
+    is not whole: some OpenCV versions decode a cut JPEG to a full-size wrong picture, so its end
+    marker is looked for first. What is altered within a JPEG's data nobody can tell: unlike PNG, it
+    has no checksum.
+    """
+    size = image_size(content)
+    if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), _FLAGS)
+    except cv2.error:
+        return None
+    if image is None or image.shape[:2] != size:
+        return None
+    if image.dtype == np.uint16:
+        image = np.right_shift(image, 8, dtype=np.uint16).astype(np.uint8)
+    return np.asarray(image, np.uint8) if image.dtype == np.uint8 else None
+
+
+def image_size(content: bytes) -> tuple[int, int] | None:
+    """Height and width in the header of an image file, or None where it has none that is whole."""
+    for start, read in _FORMATS:
+        if content.startswith(start):
+            try:
+                return read(content)
+            except (struct.error, IndexError, KeyError):
+                return None
+    return None
+
+
+def _jpeg(content: bytes) -> tuple[int, int] | None:
+    """Of the frame header; None where the end of the image is not behind the start of its data."""
+    size, position = None, 2
+    while content[position] == 0xFF:
+        marker = content[position + 1]
+        if marker == 0xFF:  # fill
+            position += 1
+            continue
+        (length,) = struct.unpack_from(">H", content, position + 2)
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", content, position + 5)
+            size = height, width
+        position += 2 + length
+        if marker == 0xDA:
+            # Within data 0xff is never followed by 0xd9.
+            return size if content.rfind(_JPEG_END) >= position else None
+    return None
+
+
+def _png(content: bytes) -> tuple[int, int] | None:
+    name, width, height = struct.unpack_from(">4sII", content, 12)
+    return (height, width) if name == b"IHDR" else None
+
+
+def _bmp(content: bytes) -> tuple[int, int]:
+    (header,) = struct.unpack_from("<I", content, 14)
+    # OS/2's first header has 16 bits; rows may be stored from the top: a negative height.
+    width, height = struct.unpack_from("<hh" if header == 12 else "<ii", content, 18)
+    return abs(height), abs(width)
+
+
+def _pnm(content: bytes) -> tuple[int, int] | None:
+    found = _PNM.match(content[:4096])
+    return (int(found[2]), int(found[1])) if found else None
+
+
+def _tiff(content: bytes) -> tuple[int, int]:
+    """Of the first picture; tags are numbered, each with its type, count and value."""
+    order = "<" if content.startswith(b"II") else ">"
+    (begin,) = struct.unpack_from(order + "I", content, 4)
+    (count,) = struct.unpack_from(order + "H", content, begin)
+    found = {}
+    for number in range(count):
+        place = begin + 2 + 12 * number
+        tag, kind, _ = struct.unpack_from(order + "HHI", content, place)
+        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT):
+            (found[tag],) = struct.unpack_from(order + _TIFF_NUMBERS[kind], content, place + 8)
+    return found[_TIFF_HEIGHT], found[_TIFF_WIDTH]
+
+
+def _webp(content: bytes) -> tuple[int, int] | None:
+    kind = content[12:16]
+    if content[8:12] != b"WEBP":
+        return None
+    if kind == b"VP8 ":
+        width, height = struct.unpack_from("<HH", content, 26)
+        return height & 0x3FFF, width & 0x3FFF
+    if kind == b"VP8L":
+        (bits,) = struct.unpack_from("<I", content, 21)
+        return (bits >> 14 & 0x3FFF) + 1, (bits & 0x3FFF) + 1
+    if kind == b"VP8X":
+        width, height = (int.from_bytes(content[at : at + 3], "little") + 1 for at in (24, 27))
+        return height, width
+    return None
+
+
+_FORMATS: tuple[tuple[bytes, Callable[[bytes], tuple[int, int] | None]], ...] = (
+    (b"\xff\xd8", _jpeg),
+    (b"\x89PNG\r\n\x1a\n", _png),
+    (b"BM", _bmp),
+    (b"P", _pnm),
+    (b"II*\0", _tiff),
+    (b"MM\0*", _tiff),
+    (b"RIFF", _webp),
+)

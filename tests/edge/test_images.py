@@ -1,0 +1,224 @@
+"""Image files: whole or not at all, their size known before they are decoded, one meaning each."""
+
+import hashlib
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cvo_edge.images import MAX_PIXELS, decode_image, image_size
+
+SUFFIXES = (".jpg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".webp")
+
+
+def picture(height=48, width=64, seed=0):
+    """Smooth with some noise, uint8 BGR."""
+    noise = np.random.default_rng(seed).integers(0, 40, (height, width, 3))
+    ramp = np.linspace(0, 200, width)[None, :, None]
+    return (noise + ramp).astype(np.uint8)
+
+
+def encoded(suffix, image):
+    done, content = cv2.imencode(suffix, image if suffix != ".pgm" else image[:, :, 0])
+    assert done
+    return content.tobytes()
+
+
+def bomb(side=32000):
+    """A PNG of one bit a pixel, 130 kB that would become gigabytes."""
+
+    def chunk(name, data):
+        checked = name + data
+        return struct.pack(">I", len(data)) + checked + struct.pack(">I", zlib.crc32(checked))
+
+    header = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
+    rows = zlib.compress(bytes((side // 8 + 1) * side), 9)
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    )
+
+
+def with_orientation(jpeg, orientation):
+    """The JPEG with an EXIF segment that asks for a rotation."""
+    tiff = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
+    data = b"Exif\0\0" + tiff
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(data) + 2) + data + jpeg[2:]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("size", [(16, 16), (17, 300), (1025, 33)])
+def test_the_size_in_the_header_is_that_of_the_picture(suffix, size):
+    assert image_size(encoded(suffix, picture(*size))) == size
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_cut_is_unreadable(suffix):
+    content = encoded(suffix, picture())
+    assert decode_image(content).shape == (48, 64, 3)
+    for length in [*range(0, len(content), max(1, len(content) // 60)), len(content) - 1]:
+        assert decode_image(content[:length]) is None, length
+
+
+def test_a_thumbnail_does_not_end_a_cut_jpeg():
+    content = encoded(".jpg", picture())
+    thumbnail = encoded(".jpg", picture(16, 16))
+    segment = b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail
+    whole = content[:2] + segment + content[2:]
+    np.testing.assert_array_equal(decode_image(whole), decode_image(content))
+    assert decode_image(whole[:-2]) is None
+    # Cameras fill their buffers with zeros.
+    np.testing.assert_array_equal(decode_image(whole + bytes(5000)), decode_image(content))
+
+
+def test_a_bomb_is_refused_from_its_header_in_little_memory(tmp_path):
+    content = bomb()
+    assert len(content) < 200_000
+    assert image_size(content) == (32000, 32000)
+    path = tmp_path / "bomb.png"
+    path.write_bytes(content)
+    code = (
+        "import resource, sys; from cvo_edge.images import decode_image; "
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; "
+        "assert decode_image(open(sys.argv[1], 'rb').read()) is None; "
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, path], capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) < 20_000  # KiB
+
+
+@pytest.mark.parametrize(("suffix", "place", "form"), [(".png", 16, ">II"), (".bmp", 18, "<ii")])
+def test_a_header_that_asks_for_too_much_is_refused(suffix, place, form):
+    content = encoded(suffix, picture(16, 16))
+
+    def asking(height, width):
+        numbers = struct.pack(form, width, height)
+        return content[:place] + numbers + content[place + len(numbers) :]
+
+    assert decode_image(asking(16, 16)) is not None
+    assert image_size(asking(70000, 65000)) == (70000, 65000)
+    assert MAX_PIXELS < 70000 * 65000
+    assert decode_image(asking(70000, 65000)) is None
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".ppm"])
+def test_16_bits_keep_their_upper_eight(suffix):
+    wide = np.random.default_rng(1).integers(0, 65536, (48, 64, 3)).astype(np.uint16)
+    np.testing.assert_array_equal(decode_image(encoded(suffix, wide)), (wide >> 8).astype(np.uint8))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_alpha_is_dropped_and_grey_repeated(suffix):
+    image = picture()
+    alpha = np.dstack([image, image[:, :, :1]])
+    np.testing.assert_array_equal(decode_image(encoded(suffix, alpha)), image)
+    grey = image[:, :, 0]
+    done, content = cv2.imencode(suffix, grey)
+    assert done
+    np.testing.assert_array_equal(decode_image(content.tobytes()), np.dstack([grey] * 3))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_camera_s_own_pixel_order_is_kept(orientation):
+    content = encoded(".jpg", picture())
+    turned = with_orientation(content, orientation)
+    np.testing.assert_array_equal(decode_image(turned), decode_image(content))
+
+
+NO_HEADER = (
+    b"",
+    b"\xff\xd8",
+    b"\xff\xd8 no jpeg \xff\xd9",
+    b"\x89PNG\r\n\x1a\n",
+    b"BM",
+    b"P6",
+    b"P6 0 0 255\n",
+    b"II*\0",
+    b"MM\0*" + b"\xff" * 60,
+    b"RIFF1234WEBPVP8X",
+    b"GIF89a" + bytes(20),
+)
+
+
+@pytest.mark.parametrize("content", NO_HEADER, ids=str)
+def test_what_has_no_header_is_no_image(content):
+    assert decode_image(content) is None
+
+
+def test_numbers_that_are_no_pixels_are_no_image():
+    done, content = cv2.imencode(".tif", picture().astype(np.float32))
+    assert done
+    assert decode_image(content.tobytes()) is None
+
+
+@settings(max_examples=200)
+@given(data=st.data(), suffix=st.sampled_from(SUFFIXES))
+def test_whatever_the_bytes_it_is_none_or_the_picture_of_the_header(data, suffix):
+    content = bytearray(encoded(suffix, picture(20, 24)))
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    image = decode_image(bytes(content))
+    if image is not None:
+        assert image.dtype == np.uint8
+        assert image.shape == (*image_size(bytes(content)), 3)
+
+
+@settings(max_examples=300)
+@given(
+    st.sampled_from([b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"BM", b"P6", b"II*\0", b"RIFF"]),
+    st.binary(),
+)
+def test_no_header_is_an_error(start, rest):
+    image_size(start + rest)
+
+
+OTHER = Path(__file__).resolve().parents[2] / ".opencv4"
+
+
+@pytest.mark.skipif(not OTHER.is_dir(), reason="no OpenCV 4.10 in .opencv4: make test")
+def test_another_release_of_opencv_reads_the_same(tmp_path, clip_dir):
+    """Whole, cut and changed files of every format, decoded by OpenCV 4.10 and by this one."""
+    generator = np.random.default_rng(2)
+    contents = [path.read_bytes() for path in sorted(clip_dir.glob("*.jpg"))[:5]]
+    wide = generator.integers(0, 65536, (48, 64, 3)).astype(np.uint16)
+    for suffix in SUFFIXES:
+        whole = encoded(suffix, picture())
+        contents += [whole, whole[: len(whole) // 2], whole[:-1]]
+        for _ in range(20):
+            changed = bytearray(whole)
+            changed[generator.integers(len(changed))] ^= 1 << int(generator.integers(8))
+            contents.append(bytes(changed))
+    contents += [encoded(suffix, wide) for suffix in (".png", ".tif", ".ppm")]
+    contents += [with_orientation(contents[0], 6), contents[0] + bytes(100)]
+    contents.append(encoded(".tif", picture().astype(np.float32)))
+    contents.append(encoded(".png", np.dstack([picture(), picture()[:, :, :1]])))
+    for number, content in enumerate(contents):
+        (tmp_path / f"{number:04d}").write_bytes(content)
+    code = (
+        "import cv2, hashlib, sys; from pathlib import Path; "
+        "from cvo_edge.images import decode_image; print(cv2.__version__); "
+        "images = [decode_image(p.read_bytes()) for p in sorted(Path(sys.argv[1]).iterdir())]; "
+        "print(*(i if i is None else hashlib.sha256(i).hexdigest() for i in images), sep='\\n')"
+    )
+    path = os.pathsep.join([str(OTHER), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    version, *theirs = done.stdout.split()
+    assert version.split(".")[0] != cv2.__version__.split(".")[0]
+    ours = [decode_image(content) for content in contents]
+    expected = ["None" if i is None else hashlib.sha256(i).hexdigest() for i in ours]
+    assert [(n, a) for n, a in enumerate(theirs)] == [(n, b) for n, b in enumerate(expected)]
