@@ -204,32 +204,24 @@ def bench(
 
 
 @app.command()
-def verify(bundle: BundleArgument, threads: ThreadsOption = None) -> None:
+def verify(
+    bundle: BundleArgument,
+    threads: ThreadsOption = None,
+    timeout: Annotated[
+        float, typer.Option(min=0.1, max=86400, help="Seconds that loading and self-test may take.")
+    ] = 60.0,
+) -> None:
     """Check every digest of a bundle, load it and run its self-test on this machine.
 
-    Of the model as it is, and as the cache has it prepared, where it has.
+    Of the model as it is, and as the cache has it prepared, where it has; in a process of its own,
+    with limits of time and memory.
     """
-    from cvo_edge.artifact import Bundle, read_bundle
-    from cvo_edge.loading import PreparedBundle, found_in
-    from cvo_edge.odometer import Odometer
-    from cvo_edge.prepared import ModelCache
-    from cvo_edge.selftest import check_selftest
+    from cvo_edge.guard import verify_bundle
 
-    content = read_bundle(bundle)
-    forms: list[Bundle | PreparedBundle] = [content]
-    prepared = found_in(ModelCache.default(), content.calibration)
-    if prepared is not None:
-        forms.append(prepared)
-    first, worst = content.calibration.thresholds[0], 0.0
-    for form in forms:
-        with Odometer(
-            form, threads=threads, confidence=first.confidence, scope=first.scope
-        ) as odometer:
-            worst = max(worst, check_selftest(odometer))
-    tolerance = content.calibration.selftest.tolerance
+    verdict = verify_bundle(bundle, threads=threads, timeout_s=timeout)
     print(
-        f"{content.calibration.name}: digests match, model loads, self-test passed "
-        f"(largest difference {worst:.2g}, tolerance {tolerance:g})"
+        f"{verdict.name}: digests match, model loads, self-test passed "
+        f"(largest difference {verdict.largest_difference:.2g}, tolerance {verdict.tolerance:g})"
     )
 
 
