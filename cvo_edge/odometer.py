@@ -11,13 +11,14 @@ from itertools import count
 from pathlib import Path
 from time import perf_counter
 from types import TracebackType
-from typing import Any, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import preprocess
 from cvo_edge.artifact import Bundle, Threshold, read_bundle
+from cvo_edge.checks import Look, StreamChecks, image_doubt
 from cvo_edge.consistency import check_consistency
 from cvo_edge.errors import CalibrationFileError, ModelError, UsageError
 from cvo_edge.heads import HEADS
@@ -50,15 +51,27 @@ class Observation:
     """What the network says of one image, before any threshold.
 
     ``outputs`` by name, each with a leading axis of one; ``pose`` (7,) with a unit quaternion and
-    ``point`` (6,), the same pose in the bundle's chart. Where ``fault`` is set none may be used.
+    ``point`` (6,), the same pose in the bundle's chart. Where ``fault`` is set none may be used;
+    where ``doubt`` is set no interval may be claimed. ``look`` is None where no image was looked
+    at.
     """
 
     outputs: dict[str, NDArray[np.float32]]
     pose: Array
     point: Array
     fault: Reason | None = None
+    doubt: Reason | None = None
+    look: Look | None = None
     preprocess_ms: float = 0.0
     model_ms: float = 0.0
+
+
+class _Estimated(NamedTuple):
+    """An estimate that the stream's checks have not seen yet, and what they look at."""
+
+    estimate: PoseInterval
+    look: Look | None
+    waited_ms: float
 
 
 class _Settings(TypedDict):
@@ -139,6 +152,7 @@ class Odometer:
         if reference is not None and calibration.pose.rotation == "tangent_predicted":
             self._limits_chart = Chart("tangent_reference", np.array(reference))
         self._limits = calibration.pose.limits
+        self._stream_checks = StreamChecks()
         self._seq = 0
 
     @classmethod
@@ -218,7 +232,8 @@ class Odometer:
         ModelError
             onnxruntime failed.
         """
-        return self._estimate(Frame(image_bgr, stamp_ns, source, read_ms), self._next_seq())
+        frame = Frame(image_bgr, stamp_ns, source, read_ms)
+        return self._in_stream(self._estimate(frame, self._next_seq()))
 
     def stream(self, frames: Iterable[Frame | NDArray[Any]]) -> Generator[PoseInterval, None, None]:
         """Step through a source, or through frames or bare BGR images, lazily, in its order.
@@ -254,18 +269,18 @@ class Odometer:
     def _one_by_one(self, frames: Iterable[Frame]) -> Iterator[PoseInterval]:
         for frame in frames:
             self._seq += frame.skipped
-            yield self._estimate(frame, self._next_seq())
+            yield self._in_stream(self._estimate(frame, self._next_seq()))
 
     def _beside_each_other(self, reads: Iterable[Callable[[], Frame]]) -> Iterator[PoseInterval]:
         numbered = zip(count(self._seq), reads, strict=False)
         tasks = (partial(self._read_and_estimate, seq, read) for seq, read in numbered)
         with closing(in_order(tasks, self._workers)) as estimates:
-            for estimate in estimates:
+            for estimated in estimates:
                 # Those under way when a stream is left have not been given to anyone.
-                self._seq = estimate.seq + 1
-                yield estimate
+                self._seq = estimated.estimate.seq + 1
+                yield self._in_stream(estimated)
 
-    def _read_and_estimate(self, seq: int, read: Callable[[], Frame]) -> PoseInterval:
+    def _read_and_estimate(self, seq: int, read: Callable[[], Frame]) -> _Estimated:
         return self._estimate(read(), seq)
 
     def _next_seq(self) -> int:
@@ -273,19 +288,20 @@ class Odometer:
         self._seq += 1
         return seq
 
-    def _estimate(self, frame: Frame, seq: int) -> PoseInterval:
+    def _estimate(self, frame: Frame, seq: int) -> _Estimated:
         start = perf_counter()
         observation = self.observe(frame.image, seq)
         concluded = perf_counter()
-        fault = observation.fault
-        region = unbounded_set() if fault else self.region(observation)
-        reasons = (fault,) if fault else self._remarks(observation, region)
+        fault, doubt = observation.fault, observation.doubt
+        against = fault or doubt
+        region = unbounded_set() if against else self.region(observation)
+        reasons = (against,) if against else self._remarks(observation, region)
         end = perf_counter()
-        return PoseInterval(
+        estimate = PoseInterval(
             seq=seq,
             stamp_ns=frame.stamp_ns,
             source=frame.source,
-            status=Status.INVALID if fault else Status.OK,
+            status=Status.INVALID if fault else Status.DEGRADED if doubt else Status.OK,
             reasons=reasons,
             pose=None if fault else Pose(observation.pose[:3], observation.pose[3:]),
             region=region,
@@ -300,9 +316,23 @@ class Odometer:
                 "total": round(frame.read_ms + frame.waited_ms + 1e3 * (end - start), 4),
             },
         )
+        return _Estimated(estimate, observation.look, frame.waited_ms)
+
+    def _in_stream(self, estimated: _Estimated) -> PoseInterval:
+        """Take back what the frames before an estimate's speak against; they come in order."""
+        estimate, look, waited_ms = estimated
+        if look is None:
+            return estimate
+        doubts = self._stream_checks.doubts(look, estimate.stamp_ns, waited_ms)
+        if not doubts:
+            return estimate
+        if estimate.status is Status.OK:
+            # Remarks on bounds that are not given any more would say nothing.
+            return replace(estimate, status=Status.DEGRADED, reasons=doubts, region=unbounded_set())
+        return replace(estimate, reasons=(*estimate.reasons, *doubts))
 
     def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
-        """Run the network on one image; the checks on image and outputs are in ``fault``."""
+        """Run the network on one image; what the frame checks say is in ``fault`` and ``doubt``."""
         session = self.session
         if session is None:
             raise UsageError("Odometer: expected an open one, found it closed")
@@ -314,11 +344,14 @@ class Odometer:
             return _faulty(Reason.IMAGE_UNSUPPORTED)
         spec = self.calibration.preprocess
         tensor = preprocess.model_input(image, spec.height, spec.width, spec.crop)
+        look = Look(tensor, (image.shape[0], image.shape[1]))
+        doubt = image_doubt(look)
         ready = perf_counter()
         outputs = session.run({"image": tensor, **self.head.extra_inputs(seq)})
         done = perf_counter()
         pose, point, fault = self._checked(outputs)
-        return Observation(outputs, pose, point, fault, 1e3 * (ready - start), 1e3 * (done - ready))
+        spent_ms = 1e3 * (ready - start), 1e3 * (done - ready)
+        return Observation(outputs, pose, point, fault, doubt, look, *spent_ms)
 
     def _checked(
         self, outputs: dict[str, NDArray[np.float32]]

@@ -38,6 +38,13 @@ class Reason(StrEnum):
     IMAGE_UNSUPPORTED = "image_unsupported"  # invalid: not a 2-D or 3-channel 8- or 16-bit image
     OUTPUT_NOT_FINITE = "output_not_finite"  # invalid: the network gave NaN or infinity
     POSE_IMPLAUSIBLE = "pose_implausible"  # invalid: outside the bundle's pose limits
+    IMAGE_BLACK = "image_black"  # degraded: hardly any light, as behind a lens cap
+    IMAGE_SATURATED = "image_saturated"  # degraded: more than half of it is white
+    IMAGE_FLAT = "image_flat"  # degraded: of one colour, without contrast
+    IMAGE_SIZE_CHANGED = "image_size_changed"  # degraded: not the size of the stream's first frame
+    FRAME_REPEATED = "frame_repeated"  # degraded: the very image of the frame before, as if frozen
+    FRAME_STALE = "frame_stale"  # degraded: it waited for more than a second
+    STAMP_NOT_LATER = "stamp_not_later"  # degraded: not after the stamp of the frame before
     BOUNDS_CROSSED = "bounds_crossed"  # ok: a negative correction emptied a set; its middle stands
     PITCH_NEAR_90 = "pitch_near_90"  # ok: |pitch| > 80 deg, roll and yaw are ill-defined
 

@@ -106,7 +106,7 @@ def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
         except SourceError:
             image = None  # the odometer flags it as it would on the device
         observation = odometer.observe(image, seq=index)
-        if observation.fault is None:
+        if observation.fault is None and observation.doubt is None:
             kept.append(index)
             seen.append(observation)
     if not seen:

@@ -8,6 +8,7 @@ import pytest
 
 from cvo_edge import Bundle, Odometer, Reason, Status, artifact
 from cvo_edge.artifact import CONFIDENCES, Threshold, decode_calibration, encode_calibration
+from cvo_edge.preprocess import selftest_image
 
 onnx = pytest.importorskip("onnx")
 
@@ -34,6 +35,7 @@ def constant_model(pose, lower, upper, height=192, width=256):
     return model.SerializeToString()
 
 
+IMAGE = selftest_image(240, 320)
 IDENTITY = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 
 
@@ -62,7 +64,7 @@ def odometer(bundle, pose=IDENTITY, lower=(-1.0,) * 6, upper=(1.0,) * 6, q_hat=(
 
 def step(bundle, **outputs):
     with odometer(bundle, **outputs) as made:
-        return made.step(np.zeros((240, 320, 3), np.uint8))
+        return made.step(IMAGE)
 
 
 def test_the_additive_set_is_the_bounds_plus_and_minus_the_threshold(bundle):
@@ -74,7 +76,7 @@ def test_the_additive_set_is_the_bounds_plus_and_minus_the_threshold(bundle):
 
 def test_a_set_is_exactly_where_the_score_is_at_most_the_threshold(bundle):
     with odometer(bundle) as made:
-        seen = made.observe(np.zeros((240, 320, 3), np.uint8), 0)
+        seen = made.observe(IMAGE, 0)
         region = made.region(seen)
         for y in np.linspace(-3, 3, 61):
             truth = np.full((1, 6), y)

@@ -65,14 +65,17 @@ def test_clip_is_covered_about_as_often_as_stated(bundle_dir, clip_dir, frames):
 
 @pytest.mark.parametrize("bad", [None, np.zeros((3, 3), np.uint8), np.zeros((40, 40, 3), float)])
 def test_a_bad_image_costs_that_frame_only(bundle_dir, frames, bad):
+    first, second = frames[0].image, frames[1].image
     with Odometer.load(bundle_dir) as odometer:
-        before, broken, after = (odometer.step(i) for i in (frames[0].image, bad, frames[0].image))
-    assert numbers(before) == numbers(after)
+        expected = [numbers(odometer.step(image)) for image in (first, second)]
+        odometer.step(frames[2].image)
+        before, broken, after = (odometer.step(image) for image in (first, bad, second))
+    assert [numbers(before), numbers(after)] == expected
     assert broken.status is Status.INVALID
     assert broken.pose is None
     assert not broken.bounded
-    expected = Reason.IMAGE_UNREADABLE if bad is None else Reason.IMAGE_UNSUPPORTED
-    assert broken.reasons == (expected,)
+    reason = Reason.IMAGE_UNREADABLE if bad is None else Reason.IMAGE_UNSUPPORTED
+    assert broken.reasons == (reason,)
 
 
 def test_a_confidence_that_is_not_stored_is_refused_with_those_that_are(bundle_dir):
