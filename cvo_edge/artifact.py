@@ -16,7 +16,7 @@ import stat
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -24,6 +24,9 @@ from msgspec import Meta, Struct
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, ModelError
 from cvo_edge.pose import Rotation, Scope
 from cvo_edge.preprocess import Crop
+
+if TYPE_CHECKING:
+    from cvo_edge.signature import Trust
 
 SCHEMA_VERSION = 1
 CALIBRATION_FILE = "calibration.json"
@@ -240,8 +243,10 @@ class Bundle:
 # -- reading ------------------------------------------------------------------------------------
 
 
-def read_bundle(folder: Path) -> Bundle:
+def read_bundle(folder: Path, trust: Trust | None = None) -> Bundle:
     """Read and check a bundle folder; the model's bytes are read once and match their digest.
+
+    With ``trust`` the signature, too.
 
     Raises
     ------
@@ -250,11 +255,11 @@ def read_bundle(folder: Path) -> Bundle:
     ModelError
         ``model.onnx`` is missing, no regular file or too large.
     BundleMismatchError
-        The model is not the one that was calibrated.
+        The model is not the one that was calibrated, or the bundle not one to trust.
     """
-    calibration = read_calibration(folder)
+    calibration = read_calibration(folder, trust)
     path = folder / MODEL_FILE
-    model_bytes = _read_regular_file(path, MAX_MODEL_BYTES, ModelError)
+    model_bytes = read_regular_file(path, MAX_MODEL_BYTES, ModelError)
     _check_model_digest(path, hashlib.sha256(model_bytes).hexdigest(), calibration)
     return Bundle(calibration, model_bytes)
 
@@ -278,14 +283,19 @@ def _check_model_digest(path: Path, found: str, calibration: Calibration) -> Non
         )
 
 
-def read_calibration(folder: Path) -> Calibration:
-    """Read and check ``calibration.json`` of a bundle folder; raises CalibrationFileError."""
+def read_calibration(folder: Path, trust: Trust | None = None) -> Calibration:
+    """Read and check ``calibration.json`` of a bundle folder; with ``trust`` its signature, too.
+
+    Raises CalibrationFileError, and BundleMismatchError for a bundle not to be trusted.
+    """
     if not folder.is_dir():
         raise CalibrationFileError(f"{folder}: expected a bundle folder, found none")
     path = folder / CALIBRATION_FILE
-    return decode_calibration(
-        _read_regular_file(path, MAX_CALIBRATION_BYTES, CalibrationFileError), str(path)
-    )
+    content = read_regular_file(path, MAX_CALIBRATION_BYTES, CalibrationFileError)
+    calibration = decode_calibration(content, str(path))
+    if trust is not None:
+        trust.check(folder, calibration.name, content)
+    return calibration
 
 
 def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibration:
@@ -312,8 +322,8 @@ def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibra
     return calibration
 
 
-def _read_regular_file(path: Path, limit: int, error: type[CvoError]) -> bytes:
-    """All bytes of a regular file of at most ``limit`` bytes."""
+def read_regular_file(path: Path, limit: int, error: type[CvoError]) -> bytes:
+    """All bytes of a regular file of at most ``limit`` bytes; else raises the error."""
     with _regular_file(path, error) as stream:
         try:
             content = stream.read(limit + 1)

@@ -72,6 +72,12 @@ CacheOption = Annotated[
         "--cache/--no-cache", help="Keep the model as it is prepared for this machine, see cache."
     ),
 ]
+PublicKeyOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Ed25519 key (PEM): take a bundle only if it is signed with it.", show_default=False
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -111,6 +117,7 @@ def run(
         typer.Option("--region", help="mcqr, scope joint: the region's points in every record."),
     ] = False,
     cache: CacheOption = True,
+    public_key: PublicKeyOption = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No summary on stderr.")] = False,
 ) -> None:
     """Estimate a pose interval for every frame of a source."""
@@ -131,6 +138,7 @@ def run(
         confidence=confidence,
         scope=scope.value,
         cache=_model_cache(cache),
+        public_key=public_key,
     ) as odometer:
         if region and not odometer.has_region:
             raise UsageError(
@@ -207,6 +215,7 @@ def bench(
 def verify(
     bundle: BundleArgument,
     threads: ThreadsOption = None,
+    public_key: PublicKeyOption = None,
     timeout: Annotated[
         float, typer.Option(min=0.1, max=86400, help="Seconds that loading and self-test may take.")
     ] = 60.0,
@@ -218,7 +227,7 @@ def verify(
     """
     from cvo_edge.guard import verify_bundle
 
-    verdict = verify_bundle(bundle, threads=threads, timeout_s=timeout)
+    verdict = verify_bundle(bundle, threads=threads, timeout_s=timeout, public_key=public_key)
     print(
         f"{verdict.name}: digests match, model loads, self-test passed "
         f"(largest difference {verdict.largest_difference:.2g}, tolerance {verdict.tolerance:g})"

@@ -51,11 +51,16 @@ class Verdict:
 
 
 def verify_bundle(
-    folder: Path, *, threads: int | None = None, timeout_s: float = TIMEOUT_S
+    folder: Path,
+    *,
+    threads: int | None = None,
+    timeout_s: float = TIMEOUT_S,
+    public_key: Path | None = None,
 ) -> Verdict:
     """Check the digests of a bundle, load it and run its self-test, in a child process.
 
-    Of the model as it is, and as the cache of prepared models has it, where it has.
+    Of the model as it is, and as the cache of prepared models has it, where it has. With a public
+    key the signature as well, and that the version is none that this device has gone beyond.
 
     Raises
     ------
@@ -74,7 +79,12 @@ def verify_bundle(
     os.set_blocking(receiver, False)
     with contextlib.ExitStack() as stack:
         answers = stack.enter_context(os.fdopen(receiver, "rb"))
-        order = {"folder": str(folder), "threads": threads, "timeout_s": timeout_s}
+        order = {
+            "folder": str(folder),
+            "threads": threads,
+            "timeout_s": timeout_s,
+            "public_key": None if public_key is None else str(public_key),
+        }
         try:
             process = subprocess.Popen(  # noqa: S603 - this very interpreter, no shell
                 # -P: a folder that happens to be the current one is not where modules come from.
@@ -118,7 +128,7 @@ def child() -> None:
     """Answer the order in ``sys.argv`` on the pipe it names."""
     sender, order = int(sys.argv[1]), json.loads(sys.argv[2])
     try:
-        verdict = _selftest(Path(order["folder"]), order["threads"], order["timeout_s"])
+        verdict = _selftest(**order)
         answer: dict[str, object] = {"verdict": asdict(verdict)}
     except CvoError as error:
         answer = {"exit_code": error.exit_code, "message": str(error)}
@@ -135,14 +145,21 @@ def child() -> None:
     os._exit(0)
 
 
-def _selftest(folder: Path, threads: int | None, timeout_s: float) -> Verdict:
+def _selftest(
+    folder: str, threads: int | None, timeout_s: float, public_key: str | None
+) -> Verdict:
     from cvo_edge.artifact import Bundle, read_bundle
     from cvo_edge.loading import PreparedBundle, found_in
     from cvo_edge.odometer import Odometer
     from cvo_edge.prepared import ModelCache
     from cvo_edge.selftest import check_selftest
 
-    content = read_bundle(folder)
+    trust = None
+    if public_key is not None:
+        from cvo_edge.signature import Trust
+
+        trust = Trust.in_key(Path(public_key))
+    content = read_bundle(Path(folder), trust)
     _limit(len(content.model_bytes), timeout_s)
     forms: list[Bundle | PreparedBundle] = [content]
     prepared = found_in(ModelCache.default(), content.calibration)

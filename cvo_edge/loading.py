@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,9 @@ from cvo_edge.errors import BundleMismatchError, ModelError
 from cvo_edge.prepared import ModelCache, Prepared, identity
 from cvo_edge.session import Session
 
+if TYPE_CHECKING:
+    from cvo_edge.signature import Trust
+
 
 @dataclass(frozen=True)
 class PreparedBundle:
@@ -30,7 +34,9 @@ class PreparedBundle:
     prepared: Prepared
 
 
-def load_bundle(folder: Path, cache: ModelCache) -> Bundle | PreparedBundle:
+def load_bundle(
+    folder: Path, cache: ModelCache, trust: Trust | None = None
+) -> Bundle | PreparedBundle:
     """Read and check a bundle folder; its model as the cache has it, or puts it there now.
 
     The bundle as it is where the cache cannot be used, or its model is of another provider. Errors
@@ -38,7 +44,7 @@ def load_bundle(folder: Path, cache: ModelCache) -> Bundle | PreparedBundle:
     the cache holds. The digest of one that has not changed since it was last taken, as the system
     has it, is not taken again.
     """
-    calibration = read_calibration(folder)
+    calibration = read_calibration(folder, trust)
     found = found_in(cache, calibration)
     if found is not None:
         model = folder / MODEL_FILE
@@ -48,7 +54,7 @@ def load_bundle(folder: Path, cache: ModelCache) -> Bundle | PreparedBundle:
             check_model_file(folder, calibration)
             cache.remember(found.prepared, model, before)
         return found
-    bundle = read_bundle(folder)
+    bundle = read_bundle(folder, trust)
     if calibration.model.provider != "onnxruntime":
         return bundle
     prepared = _prepared_now(bundle, cache)

@@ -165,14 +165,25 @@ class Odometer:
         confidence: float = 0.9,
         scope: Scope = "marginal",
         cache: ModelCache | None = None,
+        public_key: str | Path | None = None,
     ) -> Odometer:
         """Read the bundle folder and be ready to step; parameters and errors as the class's.
 
         With a cache, e.g. ``ModelCache.default()``, the model is prepared for this machine once and
-        later loaded in a fraction of time and memory; what it computes is the same.
+        later loaded in a fraction of time and memory; what it computes is the same. With a public
+        key (PEM, Ed25519) only a bundle signed with it is taken, and no older version of it from
+        then on.
         """
         folder = Path(bundle)
-        content = read_bundle(folder) if cache is None else load_bundle(folder, cache)
+        trust = None
+        if public_key is not None:
+            from cvo_edge.signature import Trust
+
+            trust = Trust.in_key(Path(public_key))
+        if cache is None:
+            content: Bundle | PreparedBundle = read_bundle(folder, trust)
+        else:
+            content = load_bundle(folder, cache, trust)
         settings: _Settings = {
             "threads": threads,
             "mode": mode,
@@ -180,12 +191,15 @@ class Odometer:
             "scope": scope,
         }
         try:
-            return cls(content, **settings)
+            odometer = cls(content, **settings)
         except ModelError:
             if isinstance(content, Bundle):
                 raise
             # Someone has cleared the cache in between.
-            return cls(read_bundle(folder), **settings)
+            odometer = cls(read_bundle(folder, trust), **settings)
+        if trust is not None:
+            trust.remember()
+        return odometer
 
     def __enter__(self) -> Odometer:
         """Return itself."""

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import glob
+import logging
 import os
 import re
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Condition, Event, Thread
 from time import perf_counter
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
-import cv2
-import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.capture import READER, TIMEOUT_S, Capture, Grabbed
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.images import decode_image
 
@@ -28,7 +29,12 @@ _PATIENCE_S = 2.0
 # Stamps are nanoseconds in 64 bits, also after years.
 LOWEST_FPS, HIGHEST_FPS = 1e-3, 1e6
 
-READER = "cvo-edge reader"
+# Before each new attempt to open a camera: eight seconds in all.
+PAUSES_S = (0.25, 0.5, 1.0, 2.0, 4.0)
+
+_LOG = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +73,7 @@ class Source(Protocol):
         """Yield the frames."""
 
 
-def open_source(text: str, fps: float | None = None) -> Source:
+def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_S) -> Source:
     """Guess from what ``text`` is: a folder, a glob, a video file, a camera's index or device.
 
     Parameters
@@ -91,12 +97,14 @@ def open_source(text: str, fps: float | None = None) -> Source:
     path = Path(text)
     if path.is_dir():
         return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
-    if path.is_char_device() or text.isdecimal():
-        return Camera(int(text) if text.isdecimal() else text, fps)
+    if text.isdecimal():
+        return Camera(int(text), fps, timeout_s)
+    if path.is_char_device() or path.is_fifo() or "://" in text:
+        return Camera(text, fps, timeout_s)
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES:
             return ImageFiles([path], fps, "")
-        return Video(path, fps)
+        return Video(path, fps, timeout_s)
     if glob.has_magic(text):
         found = [Path(name) for name in glob.glob(text, recursive=True) if Path(name).is_file()]
         return ImageFiles(_colour_images(found), fps, f"{text}: expected images, found no match")
@@ -143,12 +151,11 @@ class Video:
 
     live = False
 
-    def __init__(self, path: Path, fps: float | None) -> None:
+    def __init__(self, path: Path, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
         self._path = path
-        self._capture = _open_capture(str(path))
-        own = float(self._capture.get(cv2.CAP_PROP_FPS))
+        self._capture = Capture(str(path), timeout_s)
+        own, announced = self._capture.properties()
         self._fps = fps or (own if 0.0 < own < 1e5 else None)
-        announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.length: int | None = announced if announced > 0 else None
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
@@ -159,18 +166,11 @@ class Video:
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames; raises SourceError where the file ends before its own count."""
         seq = 0
-        try:
-            while True:
-                start = perf_counter()
-                found, image = self._capture.read()
-                if not found:
-                    break
-                spent = 1e3 * (perf_counter() - start)
+        with closing(self._capture):
+            while (grabbed := self._capture.read()) is not None:
                 name = f"{self._path.name}#{seq}"
-                yield Frame(np.asarray(image, np.uint8), _stamp(seq, self._fps), name, spent)
+                yield Frame(grabbed.image, _stamp(seq, self._fps), name, grabbed.read_ms)
                 seq += 1
-        finally:
-            self._capture.release()
         if self.length is not None and seq < self.length:
             raise SourceError(
                 f"{self._path}: expected {self.length} frames, found it ended early: "
@@ -179,15 +179,20 @@ class Video:
 
 
 class Camera:
-    """A camera by index or device path; stamps are the machine's clock when a frame arrived."""
+    """A camera by index, device path or address; stamps are the clock's when a frame arrived.
+
+    One that does not open, or gives no frame for ``timeout_s``, is given up and opened again, a few
+    times, after ever longer pauses.
+    """
 
     live = True
 
-    def __init__(self, device: int | str, fps: float | None) -> None:
-        self._device = device
-        self._fps = fps
-        self._capture = _open_capture(device)
+    def __init__(self, device: int | str, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
+        self._device, self._fps, self._timeout_s = device, fps, timeout_s
+        self._capture: Capture | None = None
+        self._failures = 0
         self.length: int | None = None
+        self._insisting(self._opened)
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield the frames, read: one comes after the other."""
@@ -195,23 +200,49 @@ class Camera:
             yield partial(_itself, frame)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames until the camera gives none; that raises SourceError."""
+        """Yield frames; raises SourceError where none comes, however often it is opened again."""
         seq = 0
         try:
             while True:
-                found = self._capture.grab()
-                stamp_ns = _stamp(seq, self._fps) if self._fps else time.time_ns()
-                start = perf_counter()
-                if found:
-                    found, image = self._capture.retrieve()
-                if not found:
-                    raise SourceError(f"camera {self._device}: gave no frame after {seq} frames")
-                spent = 1e3 * (perf_counter() - start)
-                name = f"{self._device}#{seq}"
-                yield Frame(np.asarray(image, np.uint8), stamp_ns, name, spent)
+                grabbed = self._insisting(self._grabbed)
+                stamp_ns = _stamp(seq, self._fps) if self._fps else grabbed.stamp_ns
+                yield Frame(grabbed.image, stamp_ns, f"{self._device}#{seq}", grabbed.decode_ms)
                 seq += 1
         finally:
-            self._capture.release()
+            self._close()
+
+    def _opened(self) -> Capture:
+        if self._capture is None:
+            self._capture = Capture(self._device, self._timeout_s)
+        return self._capture
+
+    def _grabbed(self) -> Grabbed | None:
+        return self._opened().read()
+
+    def _close(self) -> None:
+        if self._capture is not None:
+            self._capture.close()
+            self._capture = None
+
+    def _insisting(self, call: Callable[[], T | None]) -> T:
+        """What a call gives at last; nothing and a SourceError are failures."""
+        while True:
+            try:
+                found = call()
+            except SourceError as error:
+                problem = str(error)
+            else:
+                if found is not None:
+                    self._failures = 0
+                    return found
+                problem = f"{self._device}: expected a frame, found its end"
+            self._close()
+            if self._failures == len(PAUSES_S):
+                raise SourceError(f"{problem}, and again {self._failures} times")
+            pause_s = PAUSES_S[self._failures]
+            _LOG.warning("%s; opening it again in %g s", problem, pause_s)
+            time.sleep(pause_s)
+            self._failures += 1
 
 
 class Newest:
@@ -328,13 +359,3 @@ def _colour_images(paths: list[Path]) -> list[Path]:
 
 def _stamp(seq: int, fps: float | None) -> int | None:
     return None if fps is None else round(seq * 1_000_000_000 / fps)
-
-
-def _open_capture(device: int | str) -> cv2.VideoCapture:
-    try:
-        capture = cv2.VideoCapture(device)
-    except cv2.error:
-        capture = None
-    if capture is None or not capture.isOpened():
-        raise SourceError(f"{device}: expected a video or camera that opens, found none")
-    return capture

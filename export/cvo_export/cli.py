@@ -536,6 +536,25 @@ def calibrate(
 
 
 @app.command()
+def sign(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
+    key: Annotated[Path, typer.Option(help="Ed25519 private key (PEM).", show_default=False)],
+    bundle_version: Annotated[
+        int | None,
+        typer.Option(
+            help="Devices that have run it refuse lower ones; by default the seconds since 1970.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Sign a bundle, for devices that are told whose to take (run --public-key)."""
+    from cvo_export.sign import sign as sign_bundle
+
+    signature = sign_bundle(bundle, key, bundle_version)
+    print(f"{signature.name}: version {signature.version}, signed with the key {signature.key}")
+
+
+@app.command()
 def evaluate(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
     dataset: DatasetArgument,
