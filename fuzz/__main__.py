@@ -1,0 +1,97 @@
+"""All of it, or what is named: ``python -m fuzz [NAME[=TRIALS] ...]``.
+
+Each kind writes its file into ``bench/results/faults``; a table of all that are there is printed at
+the end, and into ``table.txt``. Exits with 1 where a trial found something.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from cvo_edge.profile import environment
+from fuzz import bundles, kills, media, sensors, simulation
+from fuzz.trials import Tally
+
+RESULTS = Path(__file__).resolve().parent.parent / "bench" / "results" / "faults"
+# Name -> what is tried, how often, and by what.
+KINDS: dict[str, tuple[str, int, Callable[[int], Tally]]] = {
+    "models": ("model.onnx with changed bytes", 8000, bundles.models),
+    "models_that_fit": ("the same, digests recomputed, by verify", 2000, bundles.models_that_fit),
+    "artifacts": ("calibration.json with changed bytes or values", 8000, bundles.artifacts),
+    "artifacts_that_fit": (
+        "the same, digest recomputed, by verify",
+        2000,
+        bundles.artifacts_that_fit,
+    ),
+    "kills": ("run killed at any time", 1000, kills.kills),
+    "sensors": ("frames of a camera, half of them faulted", 10000, sensors.sensors),
+    "images": ("image files with changed bytes, between good ones", 2000, media.images),
+    "videos": ("a video with changed bytes", 500, media.videos),
+    "coverage": ("calibration with 19, 20 and 100 scores", 1000, simulation.coverage),
+}
+
+
+def main() -> int:
+    """Run what is named."""
+    named = dict(word.partition("=")[::2] for word in sys.argv[1:])
+    unknown = sorted(set(named) - set(KINDS))
+    if unknown:
+        print(f"fuzz: expected {', '.join(KINDS)}, found {', '.join(unknown)}", file=sys.stderr)
+        return 2
+    found = 0
+    for name in named or KINDS:
+        what, count, trials = KINDS[name]
+        count = int(named.get(name) or count)
+        print(f"{name}: {what}", flush=True)
+        begin = time.monotonic()
+        tally = trials(count)
+        report(name, what, count, tally, time.monotonic() - begin)
+        found += len(tally.findings)
+    print(text := table())
+    (RESULTS / "table.txt").write_text(text, "utf-8")
+    return 1 if found else 0
+
+
+def report(name: str, what: str, count: int, tally: Tally, seconds: float) -> None:
+    """Write one kind's file, and its findings to the terminal."""
+    for finding in tally.findings[:20]:
+        print(f"  {finding}", flush=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    content: dict[str, Any] = {
+        "command": f"python -m fuzz {name}={count}",
+        "what": what,
+        "date": datetime.now(UTC).date().isoformat(),
+        "seconds": round(seconds),
+        "environment": environment(),
+        "trials": tally.trials,
+        "outcomes": dict(sorted(tally.outcomes.items())),
+        "findings": tally.findings[:1000],
+    }
+    (RESULTS / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n", "utf-8")
+
+
+def table() -> str:
+    """Return all results that are there as text."""
+    lines = ["| what | trials | findings | outcomes |", "| --- | --- | --- | --- |"]
+    for name in KINDS:
+        path = RESULTS / f"{name}.json"
+        if path.exists():
+            row = json.loads(path.read_text("utf-8"))
+            outcomes = ", ".join(
+                f"{outcome}{f' {number}' if number else ''}"
+                for outcome, number in row["outcomes"].items()
+            )
+            lines.append(
+                f"| {row['what']} | {row['trials']} | {len(row['findings'])} | {outcomes} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,158 @@
+"""Mutated models and artifacts, as they are found on a card, and with digests made to fit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import onnx
+
+from cvo_edge.artifact import CALIBRATION_FILE, MODEL_FILE, read_bundle
+from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, ModelError
+from fuzz.mutate import Generator, changed_bytes, changed_document, with_digest
+from fuzz.trials import Tally, beside_each_other, command
+
+ARTIFACTS = Path(__file__).resolve().parent.parent / "calibration_artifacts"
+# The smallest of each method; the quantised one has the operators that the others lack.
+BUNDLES = tuple(
+    ARTIFACTS / f"synthetic-room-{name}" for name in ("cjp-int8", "csp-int8", "mcqr-int8", "cjp")
+)
+# What may become of a bundle whose digests fit: all that a file can be wrong in, or a self-test
+# that fails; 0 is a bundle that passed it.
+_PERMITTED = (0, 3, 4, 5, 8)
+
+
+@contextmanager
+def _copy(number: int) -> Iterator[tuple[Path, Generator]]:
+    with tempfile.TemporaryDirectory() as folder:
+        source = BUNDLES[number % len(BUNDLES)]
+        yield (
+            Path(shutil.copytree(source, Path(folder) / "bundle")),
+            np.random.default_rng([2026, number]),
+        )
+
+
+def models(count: int) -> Tally:
+    """Change bytes of ``model.onnx``: every one is refused, before the engine sees it."""
+
+    def trial(number: int) -> tuple[str, str | None]:
+        with _copy(number) as (bundle, generator):
+            path = bundle / MODEL_FILE
+            path.write_bytes(changed_bytes(path.read_bytes(), generator))
+            return _refused(bundle, (BundleMismatchError, ModelError))
+
+    return beside_each_other(trial, count)
+
+
+def artifacts(count: int) -> Tally:
+    """Change bytes or values of ``calibration.json``: every one is refused."""
+
+    def trial(number: int) -> tuple[str, str | None]:
+        with _copy(number) as (bundle, generator):
+            path = bundle / CALIBRATION_FILE
+            content = path.read_bytes()
+            if number % 2:
+                content = changed_document(json.loads(content), generator)
+            else:
+                content = changed_bytes(content, generator)
+            path.write_bytes(content)
+            return _refused(bundle, (CalibrationFileError,))
+
+    return beside_each_other(trial, count)
+
+
+def _refused(bundle: Path, expected: tuple[type[CvoError], ...]) -> tuple[str, str | None]:
+    try:
+        read_bundle(bundle)
+    except expected as error:
+        many = "more than one line" if "\n" in str(error) else None
+        return f"exit code {error.exit_code}", many
+    except Exception as error:  # noqa: BLE001 - that is the finding
+        return "error", repr(error)
+    return "accepted", "accepted"
+
+
+def models_that_fit(count: int) -> Tally:
+    """Change a model, all digests recomputed, and ask ``verify``."""
+
+    def trial(number: int) -> tuple[str, str | None]:
+        with _copy(number) as (bundle, generator):
+            path = bundle / MODEL_FILE
+            content = path.read_bytes()
+            if number % 4 < 3:
+                content = _changed_graph(content, generator)
+            else:
+                content = changed_bytes(content, generator)
+            path.write_bytes(content)
+            calibration = bundle / CALIBRATION_FILE
+            document = json.loads(calibration.read_bytes())
+            document["model"]["sha256"] = hashlib.sha256(content).hexdigest()
+            calibration.write_bytes(with_digest(json.dumps(document).encode()))
+            return _verified(bundle)
+
+    return beside_each_other(trial, count)
+
+
+def artifacts_that_fit(count: int) -> Tally:
+    """Change ``calibration.json``, its digest recomputed, and ask ``verify``."""
+
+    def trial(number: int) -> tuple[str, str | None]:
+        with _copy(number) as (bundle, generator):
+            path = bundle / CALIBRATION_FILE
+            content = path.read_bytes()
+            if number % 4 < 3:
+                content = changed_document(json.loads(content), generator)
+            else:
+                content = changed_bytes(content, generator)
+            path.write_bytes(with_digest(content))
+            return _verified(bundle)
+
+    return beside_each_other(trial, count)
+
+
+def _verified(bundle: Path) -> tuple[str, str | None]:
+    ended = command(["verify", bundle, "--threads", 1, "--timeout", 20])
+    accepted = ended.code == 0 and b"self-test passed" not in ended.output
+    finding = "accepted without a self-test" if accepted else ended.misbehaviour(_PERMITTED)
+    return f"exit code {ended.code}", finding
+
+
+def _changed_graph(content: bytes, generator: Generator) -> bytes:
+    """Return a model that is one still: a node, an attribute, a weight or a shape is another."""
+    model = onnx.load_from_string(content)
+    graph = model.graph
+    for _ in range(int(generator.integers(1, 4))):
+        kind = int(generator.integers(6))
+        node = graph.node[int(generator.integers(len(graph.node)))]
+        weights = graph.initializer[int(generator.integers(len(graph.initializer)))]
+        if kind == 0:
+            values = bytearray(weights.raw_data)
+            if values:
+                values[int(generator.integers(len(values)))] ^= 1 << int(generator.integers(8))
+                weights.raw_data = bytes(values)
+        elif kind == 1 and weights.dims:
+            place = int(generator.integers(len(weights.dims)))
+            weights.dims[place] = int(generator.choice([0, 1, 2**31, 2**62, -1]))
+        elif kind == 2 and node.input:
+            names = [name for other in graph.node for name in other.output]
+            node.input[int(generator.integers(len(node.input)))] = str(generator.choice(names))
+        elif kind == 3 and node.attribute:
+            attribute = node.attribute[int(generator.integers(len(node.attribute)))]
+            if attribute.ints:
+                place = int(generator.integers(len(attribute.ints)))
+                attribute.ints[place] = int(generator.choice([0, -1, 7, 2**31, 2**62]))
+            elif attribute.type == onnx.AttributeProto.INT:
+                attribute.i = int(generator.choice([0, -1, 7, 2**31, 2**62]))
+            elif attribute.type == onnx.AttributeProto.FLOAT:
+                attribute.f = float(generator.choice([np.nan, np.inf, -1.0, 1e38]))
+        elif kind == 4:
+            node.op_type = str(generator.choice(["Loop", "Sin", "Expand", "Tile", "Conv", "X", ""]))
+        else:
+            graph.node.remove(node)
+    return bytes(model.SerializeToString())

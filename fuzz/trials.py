@@ -1,0 +1,91 @@
+"""What a trial must not do, and counting those that did."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+_PROGRAM = "from cvo_edge.cli import main; main()"
+
+
+@dataclass
+class Tally:
+    """Trials of one kind: how they ended, and findings, each a line that says how to repeat it."""
+
+    trials: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    findings: list[str] = field(default_factory=list)
+
+    def add(self, outcome: str, finding: str | None = None) -> None:
+        """Count one trial."""
+        self.trials += 1
+        self.outcomes[outcome] += 1
+        if finding is not None:
+            self.findings.append(finding)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended; ``code`` is negative for a signal, None where it was still at work."""
+
+    code: int | None
+    output: bytes
+    errors: str
+    seconds: float
+
+    def misbehaviour(self, allowed: Sequence[int]) -> str | None:
+        """Return what it must not have done, or None."""
+        if self.code is None:
+            return f"still at work after {self.seconds:.0f} s"
+        if self.code not in allowed:
+            return f"exit code {self.code}: {self.errors[-300:]!r}"
+        if "Traceback" in self.errors:
+            return f"a traceback: {self.errors[-300:]!r}"
+        if self.code != 0 and len(self.errors.splitlines()) != 1:
+            return f"not one line on stderr: {self.errors[-300:]!r}"
+        return None
+
+
+def command(arguments: Sequence[object], timeout_s: float = 120.0) -> Ended:
+    """Run ``cvo-edge`` with these arguments."""
+    begin = time.monotonic()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROGRAM, *map(str, arguments)],
+            capture_output=True,
+            timeout=timeout_s,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as late:
+        return Ended(None, late.stdout or b"", "", time.monotonic() - begin)
+    errors = done.stderr.decode("utf-8", "replace")
+    return Ended(done.returncode, done.stdout, errors, time.monotonic() - begin)
+
+
+def beside_each_other(trial: Callable[[int], tuple[str, str | None]], count: int) -> Tally:
+    """Run numbered trials, as many at a time as there are cores; each gives outcome and finding."""
+    tally, begin = Tally(), time.monotonic()
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for number, (outcome, finding) in enumerate(pool.map(trial, range(count))):
+            tally.add(outcome, finding and f"{number}: {finding}")
+            if (number + 1) % max(1, count // 10) == 0:
+                spent = time.monotonic() - begin
+                print(
+                    f"  {number + 1:>6} of {count}, {spent:.0f} s, {len(tally.findings)} findings",
+                    flush=True,
+                )
+    return tally
+
+
+def put(folder: Path, name: str, content: bytes) -> Path:
+    """Write a file of a trial."""
+    path = folder / name
+    path.write_bytes(content)
+    return path
