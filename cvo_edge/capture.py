@@ -24,8 +24,8 @@ from cvo_edge.errors import SourceError
 READER = "cvo-edge reader"
 
 TIMEOUT_S = 5.0
-# Network streams and some cameras take their time to open.
-_OPENING_S = 10.0
+# To open takes longer than the next frame: an address is looked up, a format is probed.
+_OPENING = 2.0
 
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ class Capture:
         self._answers: SimpleQueue[object] = SimpleQueue()
         self._given_up = False
         Thread(target=self._work, name=READER, daemon=True).start()
-        if not self._ask(self._open, max(_OPENING_S, timeout_s)):
+        if not self._ask(self._open, _OPENING * timeout_s):
             self.close()
             raise SourceError(f"{device}: expected a video or camera that opens, found none")
 
@@ -78,9 +78,10 @@ class Capture:
         return self._ask(self._grab, self._timeout_s)
 
     def close(self) -> None:
-        """Give it back, as soon as what it is at comes to an end."""
+        """Give it back, as soon as what it is at comes to an end; whoever waits need not."""
         self._given_up = True
         self._calls.put(None)
+        self._answers.put(SourceError(f"{self._device}: closed"))
 
     def _ask(self, call: Callable[[], T], timeout_s: float) -> T:
         if not self._given_up:

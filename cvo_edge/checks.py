@@ -67,22 +67,26 @@ class StreamChecks:
         self._size: tuple[int, int] | None = None
         self._stamp_ns: int | None = None
 
-    def doubts(self, look: Look, stamp_ns: int | None, waited_ms: float) -> tuple[Reason, ...]:
-        """Compare a frame with those before it, and remember it.
+    def doubts(
+        self, look: Look | None, stamp_ns: int | None, waited_ms: float
+    ) -> tuple[Reason, ...]:
+        """Compare a frame with those before it, and remember it; no look where it is no image.
 
         A camera's noise never repeats: the same image again is the old one (compared as the model
         sees it). Another size than the first frame's is another camera, or another setting of it.
         """
         doubts: tuple[Reason, ...] = ()
-        if self._before is not None and look.same_as(self._before):
-            doubts += (Reason.FRAME_REPEATED,)
-        if look.size != (self._size or look.size):
-            doubts += (Reason.IMAGE_SIZE_CHANGED,)
+        if look is not None:
+            if self._before is not None and look.same_as(self._before):
+                doubts += (Reason.FRAME_REPEATED,)
+            self._size = self._size or look.size
+            if look.size != self._size:
+                doubts += (Reason.IMAGE_SIZE_CHANGED,)
+            self._before = look
         if stamp_ns is not None:
             if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
                 doubts += (Reason.STAMP_NOT_LATER,)
             self._stamp_ns = stamp_ns
         if waited_ms > _STALE_MS:
             doubts += (Reason.FRAME_STALE,)
-        self._before, self._size = look, self._size or look.size
         return doubts

@@ -87,7 +87,8 @@ def run(
     source: Annotated[
         str,
         typer.Argument(
-            help="Folder of images, glob, video file, camera index or device.", show_default=False
+            help="Folder of images, glob, video file, camera index or device, address of a stream.",
+            show_default=False,
         ),
     ],
     output: Annotated[str, typer.Option("-o", "--output", help="File, or - for stdout.")] = "-",
@@ -108,6 +109,9 @@ def run(
     threads: ThreadsOption = None,
     max_frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many.")] = None,
     fps: Annotated[float | None, typer.Option(help="Stamp frames at this rate from zero.")] = None,
+    timeout: Annotated[
+        float, typer.Option(help="Seconds to wait for the next frame of a camera or video.")
+    ] = 5.0,
     ground_truth: Annotated[
         Path | None,
         typer.Option(help="TUM file or folder of .pose.txt; the summary then shows coverage."),
@@ -130,7 +134,7 @@ def run(
 
     _refuse_overwriting(output, Path(source), ground_truth, bundle)
     truth = open_ground_truth(ground_truth) if ground_truth else None
-    frames = open_source(source, fps)
+    frames = open_source(source, fps, timeout)
     with Odometer.load(
         bundle,
         threads=threads,

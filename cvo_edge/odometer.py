@@ -269,16 +269,14 @@ class Odometer:
             yield from self._one_by_one(map(_as_frame, frames))
 
     def _newest(self, frames: Iterable[Frame | NDArray[Any]]) -> Iterator[PoseInterval]:
-        if not isinstance(frames, Source):
-            coming: Iterable[Frame] = map(_kept, frames)
-        else:
+        if isinstance(frames, Source):
             coming = frames if frames.live else Played(frames)
-        with closing(iter(Newest(coming))) as newest:
-            try:
-                yield from self._one_by_one(newest)
-            finally:
-                if isinstance(coming, Played):
-                    coming.stop()
+            # Sources of others need not have it.
+            newest = Newest(coming, getattr(coming, "stop", None))
+        else:
+            newest = Newest(map(_kept, frames))
+        with closing(iter(newest)) as frames_in_time:
+            yield from self._one_by_one(frames_in_time)
 
     def _one_by_one(self, frames: Iterable[Frame]) -> Iterator[PoseInterval]:
         for frame in frames:
@@ -307,9 +305,9 @@ class Odometer:
         observation = self.observe(frame.image, seq)
         concluded = perf_counter()
         fault, doubt = observation.fault, observation.doubt
-        against = fault or doubt
+        against = tuple(reason for reason in (doubt, fault) if reason is not None)
         region = unbounded_set() if against else self.region(observation)
-        reasons = (against,) if against else self._remarks(observation, region)
+        reasons = against or self._remarks(observation, region)
         end = perf_counter()
         estimate = PoseInterval(
             seq=seq,
@@ -335,8 +333,6 @@ class Odometer:
     def _in_stream(self, estimated: _Estimated) -> PoseInterval:
         """Take back what the frames before an estimate's speak against; they come in order."""
         estimate, look, waited_ms = estimated
-        if look is None:
-            return estimate
         doubts = self._stream_checks.doubts(look, estimate.stamp_ns, waited_ms)
         if not doubts:
             return estimate

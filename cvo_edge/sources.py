@@ -6,7 +6,6 @@ import glob
 import logging
 import os
 import re
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -28,6 +27,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tif
 _PATIENCE_S = 2.0
 # Stamps are nanoseconds in 64 bits, also after years.
 LOWEST_FPS, HIGHEST_FPS = 1e-3, 1e6
+LONGEST_S = 3600.0
 
 # Before each new attempt to open a camera: eight seconds in all.
 PAUSES_S = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -74,26 +74,30 @@ class Source(Protocol):
 
 
 def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_S) -> Source:
-    """Guess from what ``text`` is: a folder, a glob, a video file, a camera's index or device.
+    """Guess from what ``text`` is: a folder, a glob, a video file, a camera or a stream.
 
     Parameters
     ----------
     text
         Folder of images (natural order; only ``*.color.*`` where there are any, never
-        ``*.depth.*``), a glob pattern, a video file, a camera index such as ``0``, or a device
-        path such as ``/dev/video0``.
+        ``*.depth.*``), a glob pattern, a video file, a camera index such as ``0``, a device path
+        such as ``/dev/video0``, a named pipe, or the address of a stream such as ``rtsp://...``.
     fps
         Frames per second to stamp frames with, starting at zero, instead of the source's own.
+    timeout_s
+        How long to wait for the next frame of a video or camera, twice that for it to open.
 
     Raises
     ------
     SourceError
         There is no such source, or no image in it.
     UsageError
-        ``fps`` is out of range.
+        ``fps`` or ``timeout_s`` is out of range.
     """
     if fps is not None and not LOWEST_FPS <= fps <= HIGHEST_FPS:
         raise UsageError(f"fps: expected {LOWEST_FPS:g} to {HIGHEST_FPS:g}, found {fps:g}")
+    if not 0.0 < timeout_s <= LONGEST_S:
+        raise UsageError(f"timeout: expected up to {LONGEST_S:g} s, found {timeout_s:g}")
     path = Path(text)
     if path.is_dir():
         return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
@@ -191,6 +195,7 @@ class Camera:
         self._device, self._fps, self._timeout_s = device, fps, timeout_s
         self._capture: Capture | None = None
         self._failures = 0
+        self._stopped = Event()
         self.length: int | None = None
         self._insisting(self._opened)
 
@@ -199,12 +204,19 @@ class Camera:
         for frame in self:
             yield partial(_itself, frame)
 
+    def stop(self) -> None:
+        """End the frames, whoever is waiting for the next one."""
+        self._stopped.set()
+        self._close()
+
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames; raises SourceError where none comes, however often it is opened again."""
+        """Yield frames until ``stop``; raises SourceError where none comes, opened anew or not."""
         seq = 0
         try:
-            while True:
+            while not self._stopped.is_set():
                 grabbed = self._insisting(self._grabbed)
+                if grabbed is None:
+                    return
                 stamp_ns = _stamp(seq, self._fps) if self._fps else grabbed.stamp_ns
                 yield Frame(grabbed.image, stamp_ns, f"{self._device}#{seq}", grabbed.decode_ms)
                 seq += 1
@@ -220,13 +232,13 @@ class Camera:
         return self._opened().read()
 
     def _close(self) -> None:
-        if self._capture is not None:
-            self._capture.close()
-            self._capture = None
+        capture, self._capture = self._capture, None
+        if capture is not None:
+            capture.close()
 
-    def _insisting(self, call: Callable[[], T | None]) -> T:
-        """What a call gives at last; nothing and a SourceError are failures."""
-        while True:
+    def _insisting(self, call: Callable[[], T | None]) -> T | None:
+        """What a call gives at last; nothing and a SourceError are failures. None once stopped."""
+        while not self._stopped.is_set():
             try:
                 found = call()
             except SourceError as error:
@@ -237,23 +249,26 @@ class Camera:
                     return found
                 problem = f"{self._device}: expected a frame, found its end"
             self._close()
+            if self._stopped.is_set():
+                break
             if self._failures == len(PAUSES_S):
                 raise SourceError(f"{problem}, and again {self._failures} times")
             pause_s = PAUSES_S[self._failures]
             _LOG.warning("%s; opening it again in %g s", problem, pause_s)
-            time.sleep(pause_s)
+            self._stopped.wait(pause_s)
             self._failures += 1
+        return None
 
 
 class Newest:
     """The newest frame of a source, which does not wait for whoever looks at it.
 
     A thread reads on; frames that were not looked at before the next one came are left out, and
-    counted in ``Frame.skipped``.
+    counted in ``Frame.skipped``. ``stop`` ends the source's wait for its next frame.
     """
 
-    def __init__(self, frames: Iterable[Frame]) -> None:
-        self._frames = frames
+    def __init__(self, frames: Iterable[Frame], stop: Callable[[], None] | None = None) -> None:
+        self._frames, self._stop = frames, stop
         self._changed = Condition()
         self._frame: Frame | None = None
         self._ready_at = 0.0
@@ -279,6 +294,8 @@ class Newest:
                 yield replace(frame, waited_ms=waited_ms, skipped=skipped)
         finally:
             self._closed = True
+            if self._stop is not None:
+                self._stop()
             # A thread that Python ends inside OpenCV takes the process with it.
             reader.join(_PATIENCE_S)
         if self._failure is not None:

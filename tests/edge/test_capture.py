@@ -1,0 +1,165 @@
+"""Cameras that end, hang and come back: real streams over loopback and pipes."""
+
+import http.server
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from cvo_edge import SourceError, UsageError, open_source, read_records
+from cvo_edge.sources import PAUSES_S, Camera
+
+RUN = "from cvo_edge.cli import main; main()"
+BOUNDARY = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n"
+
+
+class NetworkCamera:
+    """Motion JPEG over HTTP on loopback; ``lives`` says how each connection goes.
+
+    Each is a number of frames, and how many seconds of silence come before it is closed.
+    """
+
+    def __init__(self, pictures, lives):
+        camera, self.connections = self, 0
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def log_message(self, *_):
+                pass
+
+            def do_GET(self):
+                number, camera.connections = camera.connections, camera.connections + 1
+                if number >= len(lives):
+                    self.send_error(503)
+                    return
+                frames, silence_s = lives[number]
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+                self.end_headers()
+                try:
+                    for k in range(frames):
+                        picture = pictures[k % len(pictures)]
+                        self.wfile.write(BOUNDARY % (len(picture), picture))
+                        time.sleep(0.02)
+                    camera.stopped.wait(silence_s)
+                except OSError:
+                    pass  # it was given up
+
+        self.stopped = threading.Event()
+        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.server.daemon_threads = True
+        self.address = f"http://127.0.0.1:{self.server.server_port}/camera.mjpg"
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+
+    def close(self):
+        self.stopped.set()
+        self.server.shutdown()
+        self.server.server_close()
+
+
+@pytest.fixture
+def network_camera(clip_dir):
+    pictures = [path.read_bytes() for path in sorted(clip_dir.glob("*.jpg"))[:20]]
+    cameras = []
+
+    def start(*lives):
+        cameras.append(NetworkCamera(pictures, lives))
+        return cameras[-1]
+
+    yield start
+    for camera in cameras:
+        camera.close()
+
+
+def test_a_stream_that_hangs_or_ends_is_opened_again_and_goes_on(network_camera, caplog):
+    camera = network_camera((20, 60.0), (20, 0.0), (1000, 0.0))
+    source = open_source(camera.address, timeout_s=0.5)
+    assert source.live
+    seen = []
+    for frame in source:
+        assert frame.image.shape == (240, 320, 3)
+        seen.append((frame.source, frame.stamp_ns))
+        if len(seen) == 60:
+            break
+    assert camera.connections == 3
+    stamps = [stamp_ns for _, stamp_ns in seen]
+    assert stamps == sorted(set(stamps))
+    assert [name for name, _ in seen] == [f"{camera.address}#{number}" for number in range(60)]
+    problems = [record.getMessage() for record in caplog.records]
+    assert ["within 0.5 s, found none" in problems[0], "found its end" in problems[1]] == [True] * 2
+
+
+def test_a_camera_that_is_gone_is_given_up_after_bounded_attempts(network_camera, caplog):
+    camera = network_camera((10, 0.0))
+    begin = time.monotonic()
+    seen = []
+    with pytest.raises(SourceError, match=f"and again {len(PAUSES_S)} times"):
+        seen.extend(open_source(camera.address, timeout_s=0.5))
+    assert 0 < len(seen) <= 10
+    assert len(caplog.records) == len(PAUSES_S)
+    assert time.monotonic() - begin < sum(PAUSES_S) + 30.0
+
+
+def test_a_camera_that_never_answers_is_given_up(bundle_dir, tmp_path):
+    """In a process of its own: OpenCV opens one stream at a time, and this one never is."""
+    pipe = tmp_path / "camera"
+    os.mkfifo(pipe)
+    arguments = ["run", bundle_dir, pipe, "--timeout", "0.1"]
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (6, "")
+    *attempts, last = done.stderr.splitlines()
+    assert len(attempts) == len(PAUSES_S)
+    assert last.startswith(f"cvo-edge: {pipe}: expected an answer within 0.2 s, found none, and")
+
+
+def test_nobody_there_is_refused_in_the_same_way():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"http://127.0.0.1:{free.getsockname()[1]}/camera.mjpg"
+    with pytest.raises(SourceError, match="expected a video or camera that opens"):
+        open_source(address, timeout_s=1.0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_answered_within_a_second_while_a_read_blocks(
+    network_camera, bundle_dir, tmp_path, number
+):
+    camera = network_camera((15, 120.0))
+    records = tmp_path / "records.jsonl"
+    arguments = ["run", bundle_dir, camera.address, "-o", records]
+    process = subprocess.Popen(
+        [sys.executable, "-c", RUN, *map(str, arguments)], stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline and not (records.exists() and records.stat().st_size):
+        time.sleep(0.02)
+    time.sleep(1.5)
+    seen = len(list(read_records(records)))
+    begin = time.monotonic()
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=30)
+    assert time.monotonic() - begin < 1.0
+    assert process.returncode == 128 + number
+    assert "Traceback" not in errors
+    assert len(list(read_records(records))) >= seen > 0
+
+
+@pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_time_to_wait_must_be_one(timeout_s, tmp_path):
+    with pytest.raises(UsageError, match="timeout"):
+        open_source(str(tmp_path), timeout_s=timeout_s)
+
+
+def test_camera_is_what_a_pipe_and_an_address_are(network_camera):
+    camera = network_camera((1000, 0.0))
+    assert isinstance(open_source(camera.address), Camera)
