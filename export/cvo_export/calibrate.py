@@ -61,8 +61,8 @@ class Observed:
     """Frames that passed the frame checks, as the runtime sees them, stacked over n frames.
 
     ``outputs`` by name (n, ...); ``point`` (n, 6) and ``truth`` (n, 6) in the bundle's chart;
-    ``pose`` (n, 7) and ``true_pose`` (n, 7); ``sequence`` (n,) the sequence number; ``flagged``
-    counts frames that a check left out.
+    ``pose`` (n, 7) and ``true_pose`` (n, 7); ``sequence`` (n,) the sequence number; ``invalid``
+    and ``degraded`` count the frames that the checks left out.
     """
 
     indices: NDArray[np.int64]
@@ -72,7 +72,8 @@ class Observed:
     pose: Array
     true_pose: Array
     sequence: NDArray[np.int64]
-    flagged: int
+    invalid: int
+    degraded: int
 
     def scored(self, head: Head) -> Scored:
         """Return the scores of the true poses."""
@@ -100,13 +101,18 @@ def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
     """
     kept: list[int] = []
     seen: list[Observation] = []
+    invalid = degraded = 0
     for index in indices.tolist():
         try:
             image = dataset.read_image(index)
         except SourceError:
             image = None  # the odometer flags it as it would on the device
         observation = odometer.observe(image, seq=index)
-        if observation.fault is None and observation.doubt is None:
+        if observation.fault is not None:
+            invalid += 1
+        elif observation.doubt is not None:
+            degraded += 1
+        else:
             kept.append(index)
             seen.append(observation)
     if not seen:
@@ -126,7 +132,8 @@ def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
         pose=pose,
         true_pose=true_pose,
         sequence=dataset.sequence[kept],
-        flagged=len(indices) - len(seen),
+        invalid=invalid,
+        degraded=degraded,
     )
 
 

@@ -307,11 +307,17 @@ def _with_noise(bundle: Path, config: TrainConfig, text: str) -> NoiseFigures | 
         return None
     again = report["recalibrated"]["levels"]
     return NoiseFigures(
-        invalid=report["frames"]["invalid"],
+        invalid=_left_out(report),
         point_error=report["point_error"],
         clean=_figures(find_level(report["levels"], CONFIDENCE, "marginal")),
         recalibrated=_figures(find_level(again, CONFIDENCE, "marginal")),
     )
+
+
+def _left_out(report: Mapping[str, Any]) -> int:
+    """Frames that did not pass the checks, whichever."""
+    frames = report["frames"]
+    return int(frames["invalid"] + frames["degraded"])
 
 
 def _finished(folder: CellFolder, name: str, config: TrainConfig) -> Cell:
@@ -331,7 +337,7 @@ def _finished(folder: CellFolder, name: str, config: TrainConfig) -> Cell:
         options=digest(config),
         bundle=calibration.digest,
         score=report["score"],
-        frames={key: report["frames"][key] for key in ("total", "invalid")},
+        frames={"total": report["frames"]["total"], "invalid": _left_out(report)},
         marginal=_figures(marginal),
         joint=_figures(joint),
         own=None if report["own"] is None else _figures(report["own"]),

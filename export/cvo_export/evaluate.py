@@ -109,8 +109,8 @@ def evaluate(
             "frames": {
                 "total": len(indices),
                 "bounded": _bounded(levels, len(seen.indices)),
-                "degraded": 0,
-                "invalid": seen.flagged,
+                "degraded": seen.degraded,
+                "invalid": seen.invalid,
             },
             "n_calibration": calibration.calibration.n,
             # Then "all" may hold frames that the network was trained on.
@@ -235,7 +235,8 @@ def table(report: Mapping[str, Any]) -> list[str]:
     lines = [
         f"{report['bundle']} ({report['method']}, {report['score']} score) on {report['dataset']}, "
         f"{report['subset']} frames of a {report['split']} split",
-        f"frames {frames['total']}, invalid {frames['invalid']}; calibrated on "
+        f"frames {frames['total']}, invalid {frames['invalid']}, degraded {frames['degraded']}; "
+        f"calibrated on "
         f"{report['n_calibration']}",
         f"point error  median {100 * error['median_m']:.2f} cm {error['median_deg']:.2f} deg, "
         f"90 % {100 * error['p90_m']:.2f} cm {error['p90_deg']:.2f} deg",

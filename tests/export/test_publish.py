@@ -162,7 +162,19 @@ def test_a_damaged_image_costs_that_frame_only(tiny_bundle, tiny_run):
     with Odometer.load(tiny_bundle) as odometer:
         seen = observe(odometer, holed, np.arange(3))
     assert seen.indices.tolist() == [0, 2]
-    assert seen.flagged == 1
+    assert (seen.invalid, seen.degraded) == (1, 0)
+
+
+def test_a_frame_that_nothing_may_be_claimed_of_is_not_calibrated_with(tiny_bundle, tiny_run):
+    def read_image(index):
+        image = tiny_run.dataset.read_image(index)
+        return np.zeros_like(image) if index == 1 else image
+
+    holed = dataclasses.replace(tiny_run.dataset, read_image=read_image)
+    with Odometer.load(tiny_bundle) as odometer:
+        seen = observe(odometer, holed, np.arange(3))
+    assert seen.indices.tolist() == [0, 2]
+    assert (seen.invalid, seen.degraded) == (0, 1)
 
 
 def test_no_frame_that_passes_is_a_usage_error(tiny_bundle, tiny_run):
