@@ -13,10 +13,11 @@ import math
 import os
 import re
 import stat
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -25,8 +26,8 @@ from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError,
 from cvo_edge.pose import Rotation, Scope
 from cvo_edge.preprocess import Crop
 
-if TYPE_CHECKING:
-    from cvo_edge.signature import Trust
+# What else may speak against a bundle: its folder, its name, the bytes of its calibration.json.
+Check = Callable[[Path, str, bytes], None]
 
 SCHEMA_VERSION = 1
 CALIBRATION_FILE = "calibration.json"
@@ -243,10 +244,10 @@ class Bundle:
 # -- reading ------------------------------------------------------------------------------------
 
 
-def read_bundle(folder: Path, trust: Trust | None = None) -> Bundle:
+def read_bundle(folder: Path, check: Check | None = None) -> Bundle:
     """Read and check a bundle folder; the model's bytes are read once and match their digest.
 
-    With ``trust`` the signature, too.
+    With a ``check``, e.g. of a signature, that as well.
 
     Raises
     ------
@@ -255,9 +256,9 @@ def read_bundle(folder: Path, trust: Trust | None = None) -> Bundle:
     ModelError
         ``model.onnx`` is missing, no regular file or too large.
     BundleMismatchError
-        The model is not the one that was calibrated, or the bundle not one to trust.
+        The model is not the one that was calibrated; and what the check raises.
     """
-    calibration = read_calibration(folder, trust)
+    calibration = read_calibration(folder, check)
     path = folder / MODEL_FILE
     model_bytes = read_regular_file(path, MAX_MODEL_BYTES, ModelError)
     _check_model_digest(path, hashlib.sha256(model_bytes).hexdigest(), calibration)
@@ -283,18 +284,18 @@ def _check_model_digest(path: Path, found: str, calibration: Calibration) -> Non
         )
 
 
-def read_calibration(folder: Path, trust: Trust | None = None) -> Calibration:
-    """Read and check ``calibration.json`` of a bundle folder; with ``trust`` its signature, too.
+def read_calibration(folder: Path, check: Check | None = None) -> Calibration:
+    """Read and check ``calibration.json`` of a bundle folder.
 
-    Raises CalibrationFileError, and BundleMismatchError for a bundle not to be trusted.
+    Raises CalibrationFileError, and what a ``check`` raises.
     """
     if not folder.is_dir():
         raise CalibrationFileError(f"{folder}: expected a bundle folder, found none")
     path = folder / CALIBRATION_FILE
     content = read_regular_file(path, MAX_CALIBRATION_BYTES, CalibrationFileError)
     calibration = decode_calibration(content, str(path))
-    if trust is not None:
-        trust.check(folder, calibration.name, content)
+    if check is not None:
+        check(folder, calibration.name, content)
     return calibration
 
 

@@ -154,12 +154,12 @@ def _selftest(
     from cvo_edge.prepared import ModelCache
     from cvo_edge.selftest import check_selftest
 
-    trust = None
+    check = None
     if public_key is not None:
         from cvo_edge.signature import Trust
 
-        trust = Trust.in_key(Path(public_key))
-    content = read_bundle(Path(folder), trust)
+        check = Trust.in_key(Path(public_key)).check
+    content = read_bundle(Path(folder), check)
     _limit(len(content.model_bytes), timeout_s)
     forms: list[Bundle | PreparedBundle] = [content]
     prepared = found_in(ModelCache.default(), content.calibration)

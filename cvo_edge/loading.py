@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from cvo_edge.artifact import (
     MODEL_FILE,
     Bundle,
     Calibration,
+    Check,
     TensorSpec,
     check_model_file,
     read_bundle,
@@ -21,9 +21,6 @@ from cvo_edge.artifact import (
 from cvo_edge.errors import BundleMismatchError, ModelError
 from cvo_edge.prepared import ModelCache, Prepared, identity
 from cvo_edge.session import Session
-
-if TYPE_CHECKING:
-    from cvo_edge.signature import Trust
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class PreparedBundle:
 
 
 def load_bundle(
-    folder: Path, cache: ModelCache, trust: Trust | None = None
+    folder: Path, cache: ModelCache, check: Check | None = None
 ) -> Bundle | PreparedBundle:
     """Read and check a bundle folder; its model as the cache has it, or puts it there now.
 
@@ -44,7 +41,7 @@ def load_bundle(
     the cache holds. The digest of one that has not changed since it was last taken, as the system
     has it, is not taken again.
     """
-    calibration = read_calibration(folder, trust)
+    calibration = read_calibration(folder, check)
     found = found_in(cache, calibration)
     if found is not None:
         model = folder / MODEL_FILE
@@ -54,7 +51,7 @@ def load_bundle(
             check_model_file(folder, calibration)
             cache.remember(found.prepared, model, before)
         return found
-    bundle = read_bundle(folder, trust)
+    bundle = read_bundle(folder, check)
     if calibration.model.provider != "onnxruntime":
         return bundle
     prepared = _prepared_now(bundle, cache)

@@ -180,10 +180,11 @@ class Odometer:
             from cvo_edge.signature import Trust
 
             trust = Trust.in_key(Path(public_key))
+        check = None if trust is None else trust.check
         if cache is None:
-            content: Bundle | PreparedBundle = read_bundle(folder, trust)
+            content: Bundle | PreparedBundle = read_bundle(folder, check)
         else:
-            content = load_bundle(folder, cache, trust)
+            content = load_bundle(folder, cache, check)
         settings: _Settings = {
             "threads": threads,
             "mode": mode,
@@ -196,7 +197,7 @@ class Odometer:
             if isinstance(content, Bundle):
                 raise
             # Someone has cleared the cache in between.
-            odometer = cls(read_bundle(folder, trust), **settings)
+            odometer = cls(read_bundle(folder, check), **settings)
         if trust is not None:
             trust.remember()
         return odometer

@@ -273,6 +273,61 @@ def test_no_mutated_byte_is_accepted(content, data):
         decode_calibration(content[:position] + bytes([value]) + content[position + 1 :])
 
 
+# What JSON can hold, numbers that floats cannot tell apart and words that only look like numbers.
+json_values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**70), 2**70)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=8)
+    | st.sampled_from(["marginal", "joint", "cjp", "csp", "1", "NaN"]),
+    lambda inner: (
+        st.lists(inner, max_size=7)
+        | st.dictionaries(st.sampled_from(["q_hat", "n", "x"]), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+def places(node, path=()):
+    """Yield the path of every key and element of a document."""
+    pairs = node.items() if isinstance(node, dict) else enumerate(node)
+    for key, value in pairs:
+        yield (*path, key)
+        if isinstance(value, (dict, list)):
+            yield from places(value, (*path, key))
+
+
+def same(one, other):
+    """Whether two documents say the same, 1 and 1.0 alike, but not 1 and True."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, bool) or isinstance(other, bool):
+        return one is other
+    if isinstance(one, (int, float)) and isinstance(other, (int, float)):
+        return float(one) == float(other)
+    return one == other
+
+
+@settings(max_examples=400)
+@given(data=st.data())
+def test_what_is_accepted_is_what_was_written(document, data):
+    path = data.draw(st.sampled_from(sorted(places(document), key=str)))
+    value = data.draw(json_values | st.just(...))
+    changed = replaced(document, path, value)
+    try:
+        read = decode_calibration(redigested(changed))
+    except CalibrationFileError as error:
+        message = str(error)
+    else:
+        written = json.loads(encode_calibration(read))
+        assert same({**written, "digest": ""}, {**changed, "digest": ""})
+        message = ""
+    assert "\n" not in message
+
+
 def test_what_would_be_refused_is_never_written(bundle):
     wrong = msgspec.structs.replace(bundle.calibration, thresholds=())
     with pytest.raises(CalibrationFileError):

@@ -296,8 +296,8 @@ def too_many_open_files(path):
 
 
 def test_an_entry_that_vanishes_while_it_is_loaded_is_done_without(bundle_dir, cache, monkeypatch):
-    def load_and_clear(folder, of):
-        found = load_bundle(folder, of)
+    def load_and_clear(folder, of, check):
+        found = load_bundle(folder, of, check)
         of.clear()
         return found
 
