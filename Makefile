@@ -8,7 +8,7 @@ METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 CLIP := calibration_artifacts/synthetic-room-clip
 
-.PHONY: help demo test check bench soak arm64 avx2 format clean
+.PHONY: help demo test check bench soak fuzz arm64 avx2 format clean
 
 help:
 	@echo "make demo    install the runtime alone and run the demonstration bundles on a sample clip"
@@ -18,6 +18,7 @@ help:
 	@echo "make check   lint, formatting, types and import rules"
 	@echo "make bench   compare speed, memory and start side by side; an hour on a quiet machine"
 	@echo "make soak    a million frames: does memory grow? half an hour"
+	@echo "make fuzz    ten thousand damaged models, artifacts and sensors, a thousand kills; hours"
 	@echo "make format  reformat the code"
 	@echo "make clean   remove the virtual environments, emulated boards and networks of make bench"
 
@@ -72,6 +73,10 @@ bench: $(VENV)/.installed
 
 soak: $(VENV)/.installed
 	$(VENV)/bin/python bench/soak.py
+
+# One kind alone: .venv/bin/python -m fuzz NAME, or NAME=TRIALS.
+fuzz: $(VENV)/.installed
+	$(VENV)/bin/python -m fuzz
 
 format: $(VENV)/.installed
 	$(VENV)/bin/ruff check --fix .

@@ -71,6 +71,7 @@ def report(name: str, what: str, count: int, tally: Tally, seconds: float) -> No
         "seconds": round(seconds),
         "environment": environment(),
         "trials": tally.trials,
+        "summary": tally.summary or ", ".join(f"{o}: {n}" for o, n in tally.outcomes.most_common()),
         "outcomes": dict(sorted(tally.outcomes.items())),
         "findings": tally.findings[:1000],
     }
@@ -84,13 +85,8 @@ def table() -> str:
         path = RESULTS / f"{name}.json"
         if path.exists():
             row = json.loads(path.read_text("utf-8"))
-            outcomes = ", ".join(
-                f"{outcome}{f' {number}' if number else ''}"
-                for outcome, number in row["outcomes"].items()
-            )
-            lines.append(
-                f"| {row['what']} | {row['trials']} | {len(row['findings'])} | {outcomes} |"
-            )
+            cells = (row["what"], row["trials"], len(row["findings"]), row["summary"])
+            lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines) + "\n"
 
 

@@ -108,15 +108,23 @@ def sensors(count: int) -> Tally:
                     else None,
                 )
         print(f"  {bundle.name}: {tally.trials} of {count}", flush=True)
+    by_status = {
+        status: sum(n for name, n in tally.outcomes.items() if name.endswith(f", {status}"))
+        for status in (Status.DEGRADED, Status.INVALID)
+    }
+    tally.summary = ", ".join(f"{n} {status}" for status, n in by_status.items())
     _check_false_alarms(tally)
     return tally
 
 
 def _check_false_alarms(tally: Tally) -> None:
     clean = {name: n for name, n in tally.outcomes.items() if name.startswith("clean, ")}
-    wrong = sum(n for name, n in clean.items() if name != "clean, ok")
-    if wrong > _FALSE_ALARMS * sum(clean.values()):
-        tally.findings.append(f"{wrong} of {sum(clean.values())} clean frames were flagged")
+    count = sum(clean.values())
+    wrong = count - clean.get("clean, ok", 0)
+    said = f"{wrong} of {count} clean frames flagged"
+    tally.summary = "; ".join(filter(None, (tally.summary, said)))
+    if wrong > _FALSE_ALARMS * count:
+        tally.findings.append(said)
 
 
 def _estimates(
@@ -172,6 +180,8 @@ def recordings(count: int) -> Tally:
             content = path.read_bytes()
             tally.add(_told_of(decode_image(content), content == before, checks))
             before = content
+    twice = sum(n for name, n in tally.outcomes.items() if name.startswith("twice"))
+    tally.summary = f"{twice} frames that a recording holds twice, told of"
     _check_false_alarms(tally)
     return tally
 

@@ -21,7 +21,7 @@ def coverage(count: int) -> Tally:
     errors (each repetition's coverage is Beta-binomial). Where k > n it is unbounded. One trial is
     one repetition of one n at one confidence.
     """
-    tally = Tally()
+    tally, said = Tally(), list[str]()
     for n in SIZES:
         generator = np.random.default_rng([2031, n])
         # With signs and a heavy tail: only their order counts.
@@ -43,10 +43,10 @@ def coverage(count: int) -> Tally:
             expected, a, b = k / (n + 1), k, n + 1 - k
             variance = a * b * (a + b + _TESTS) / ((a + b) ** 2 * (a + b + 1) * _TESTS)
             off = (covered.mean() - expected) / math.sqrt(variance / count)
-            tally.outcomes[
-                f"n {n}, {confidence:g}: mean {covered.mean():.4f}, k/(n+1) {expected:.4f}"
-            ] += 0
-            # Ties can only cover more often.
+            said.append(
+                f"n {n}, {confidence:g}: {covered.mean():.4f} of {expected:.4f} ({off:+.1f})"
+            )
             if abs(off) > _STANDARD_ERRORS:
                 tally.findings.append(f"n {n}, {confidence}: {off:.1f} standard errors off")
+    tally.summary = f"coverage of k/(n + 1) (standard errors off): {'; '.join(said)}"
     return tally

@@ -17,11 +17,15 @@ _PROGRAM = "from cvo_edge.cli import main; main()"
 
 @dataclass
 class Tally:
-    """Trials of one kind: how they ended, and findings, each a line that says how to repeat it."""
+    """Trials of one kind: how they ended, and findings, each a line that says how to repeat it.
+
+    ``summary`` is what the table says of them, by default the outcomes.
+    """
 
     trials: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     findings: list[str] = field(default_factory=list)
+    summary: str = ""
 
     def add(self, outcome: str, finding: str | None = None) -> None:
         """Count one trial."""

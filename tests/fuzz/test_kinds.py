@@ -1,0 +1,94 @@
+"""``make fuzz`` in small: nothing is found, and what is expected to happen does."""
+
+import numpy as np
+import pytest
+
+from fuzz import bundles, kills, media, sensors, simulation
+from fuzz.__main__ import KINDS
+from fuzz.mutate import changed_bytes, changed_document, with_digest
+from fuzz.trials import Ended
+
+SHORT = {
+    "models": 24,
+    "models_that_fit": 8,
+    "artifacts": 400,
+    "artifacts_that_fit": 6,
+    "kills": 4,
+    "sensors": 200,
+    "recordings": 40,
+    "images": 40,
+    "videos": 6,
+    "coverage": 100,
+}
+# What some trial of a kind must have led to: or nothing was tried.
+SEEN = {
+    "models": "exit code 5",
+    "artifacts": "exit code 3",
+    "artifacts_that_fit": "exit code 3",
+    "sensors": "frozen, degraded",
+    "images": "invalid",
+    "videos": "exit code 6",
+    "coverage": "n 19, 0.99: unbounded",
+}
+
+
+def test_every_kind_is_here():
+    assert SHORT.keys() == KINDS.keys()
+
+
+@pytest.mark.parametrize("kind", SHORT)
+def test_nothing_is_found(kind):
+    _, _, trials = KINDS[kind]
+    tally = trials(SHORT[kind])
+    assert tally.findings == []
+    if kind == "recordings" and not tally.trials:
+        pytest.skip("CVO_DATA is not set: no real recordings")
+    assert tally.trials >= SHORT[kind]
+    assert tally.outcomes[SEEN.get(kind, "")] > 0 or kind not in SEEN
+
+
+def test_what_would_be_a_finding_is_one(monkeypatch, artifacts_dir):
+    # A reader without digests takes what it is given.
+    monkeypatch.setattr(bundles, "read_bundle", lambda _: None)
+    assert len(bundles.models(4).findings) == len(bundles.artifacts(4).findings) == 4
+    # Nothing is looked at: every fault has an interval.
+    monkeypatch.setattr("cvo_edge.odometer.image_doubt", lambda _: None)
+    monkeypatch.setattr("cvo_edge.checks.StreamChecks.doubts", lambda *_: ())
+    assert sensors.sensors(40).findings
+    monkeypatch.setattr(simulation, "conformal_quantile", lambda scores, _: scores.max())
+    assert simulation.coverage(10).findings
+
+
+def test_what_was_seen_and_is_not_there_is_lost(monkeypatch):
+    monkeypatch.setattr(kills, "read_records", lambda _: iter(()))
+    assert list(kills.kills(1).outcomes) == ["lost"]
+
+
+def test_another_pose_behind_a_damaged_image_is_found(monkeypatch):
+    monkeypatch.setattr(media, "_as_ever", lambda: {f"{number:03d}": None for number in range(20)})
+    assert media.images(20).findings
+
+
+@pytest.mark.parametrize(
+    ("ended", "said"),
+    [
+        (Ended(None, b"", "", 9.0), "still at work"),
+        (Ended(-11, b"", "", 1.0), "exit code -11"),
+        (Ended(4, b"", "Traceback (most recent call last):", 1.0), "a traceback"),
+        (Ended(4, b"", "one\ntwo\n", 1.0), "not one line"),
+        (Ended(4, b"", "one\n", 1.0), None),
+    ],
+)
+def test_what_a_command_must_not_do(ended, said):
+    found = ended.misbehaviour((0, 4))
+    assert (found is None) if said is None else said in found
+
+
+def test_what_is_changed_is_another_and_its_digest_fits(bundle_dir):
+    content = (bundle_dir / "calibration.json").read_bytes()
+    assert with_digest(content) == content
+    for seed in range(50):
+        assert changed_bytes(content, np.random.default_rng(seed)) != content
+    document = {"a": [1, 2.5, "x"], "b": {"c": None, "digits": 12}}
+    changed = {changed_document(document, np.random.default_rng(seed)) for seed in range(50)}
+    assert len(changed) > 40
