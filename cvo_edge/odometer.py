@@ -44,6 +44,8 @@ Array = NDArray[np.float64]
 _STEEP_PITCH = np.deg2rad(80.0)
 # Numbers that Python looks at in less time than numpy's first call takes.
 _FEW = 64
+# Metres, radians, standard deviations, probabilities, logits: no output is near this in any unit.
+_ABSURD = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,7 +375,9 @@ class Odometer:
         looked at one by one than by many of numpy's functions.
         """
         values = outputs["pose"][0].tolist()
-        if not all(map(_all_finite, outputs.values())):
+        # NaN is not below anything.
+        sensible = all(_sum_of_magnitudes(output) < _ABSURD for output in outputs.values())
+        if not sensible and not all(np.isfinite(output).all() for output in outputs.values()):
             return np.array(values), np.array(values[:6]), Reason.OUTPUT_NOT_FINITE
         length = math.hypot(*values[3:])
         # Unit, and of the two quaternions of a rotation the one with qw >= 0.
@@ -389,7 +393,9 @@ class Odometer:
                 self._limits.lowest, plausible.tolist(), self._limits.highest, strict=True
             )
         )
-        return pose, point, None if inside else Reason.POSE_IMPLAUSIBLE
+        if not inside:
+            return pose, point, Reason.POSE_IMPLAUSIBLE
+        return pose, point, None if sensible else Reason.OUTPUT_ABSURD
 
     @property
     def has_region(self) -> bool:
@@ -419,10 +425,12 @@ class Odometer:
         return remarks
 
 
-def _all_finite(output: NDArray[np.float32]) -> bool:
+def _sum_of_magnitudes(output: NDArray[np.float32]) -> float:
     if output.size <= _FEW:
-        return all(map(math.isfinite, output.ravel().tolist()))
-    return bool(np.isfinite(output).all())
+        return sum(map(abs, output.ravel().tolist()))
+    # Numbers that are each finite may have a sum that is not.
+    with np.errstate(over="ignore"):
+        return float(np.abs(output).sum())
 
 
 def _as_frame(frame: Frame | NDArray[Any]) -> Frame:

@@ -37,6 +37,7 @@ class Reason(StrEnum):
     IMAGE_UNREADABLE = "image_unreadable"  # invalid: the file or stream gave no whole image
     IMAGE_UNSUPPORTED = "image_unsupported"  # invalid: not a 2-D or 3-channel 8- or 16-bit image
     OUTPUT_NOT_FINITE = "output_not_finite"  # invalid: the network gave NaN or infinity
+    OUTPUT_ABSURD = "output_absurd"  # invalid: the network gave numbers of no sensible size
     POSE_IMPLAUSIBLE = "pose_implausible"  # invalid: outside the bundle's pose limits
     IMAGE_BLACK = "image_black"  # degraded: hardly any light, as behind a lens cap
     IMAGE_SATURATED = "image_saturated"  # degraded: more than half of it is white

@@ -8,6 +8,7 @@ import pytest
 
 from cvo_edge import Bundle, Odometer, Reason, Status, artifact
 from cvo_edge.artifact import CONFIDENCES, Threshold, decode_calibration, encode_calibration
+from cvo_edge.geometry import euler_zyx_to_quaternion
 from cvo_edge.preprocess import selftest_image
 
 onnx = pytest.importorskip("onnx")
@@ -39,7 +40,14 @@ IMAGE = selftest_image(240, 320)
 IDENTITY = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def odometer(bundle, pose=IDENTITY, lower=(-1.0,) * 6, upper=(1.0,) * 6, q_hat=(0.5,) * 6):
+def odometer(
+    bundle,
+    pose=IDENTITY,
+    lower=(-1.0,) * 6,
+    upper=(1.0,) * 6,
+    q_hat=(0.5,) * 6,
+    rotation="tangent_reference",
+):
     model_bytes = constant_model(pose, lower, upper)
     calibration = bundle.calibration
     model = msgspec.structs.replace(
@@ -50,7 +58,10 @@ def odometer(bundle, pose=IDENTITY, lower=(-1.0,) * 6, upper=(1.0,) * 6, q_hat=(
         calibration,
         model=model,
         pose=msgspec.structs.replace(
-            calibration.pose, limits=limits, reference_q_xyzw=(0.0, 0.0, 0.0, 1.0)
+            calibration.pose,
+            limits=limits,
+            rotation=rotation,
+            reference_q_xyzw=None if rotation == "euler_zyx" else (0.0, 0.0, 0.0, 1.0),
         ),
         calibration=msgspec.structs.replace(calibration.calibration, score="additive"),
         thresholds=tuple(
@@ -101,6 +112,41 @@ def test_an_absurd_pose_makes_the_frame_invalid(bundle, pose):
     found = step(bundle, pose=pose)
     assert found.status is Status.INVALID
     assert found.reasons == (Reason.POSE_IMPLAUSIBLE,)
+
+
+@pytest.mark.parametrize("output", ["lower", "upper"])
+def test_an_absurd_bound_makes_the_frame_invalid(bundle, output):
+    found = step(bundle, **{output: (0.0, 0.0, 3e38, 3e38, 0.0, 0.0)})
+    assert found.status is Status.INVALID
+    assert found.reasons == (Reason.OUTPUT_ABSURD,)
+    assert not found.bounded
+
+
+@pytest.mark.parametrize("degrees", [79.0, 81.0, 90.0, -85.0])
+def test_steep_pitch_is_defined_and_told_of_where_angles_are_euler(bundle, degrees):
+    quaternion = euler_zyx_to_quaternion(np.deg2rad([10.0, degrees, 20.0]))
+    found = step(bundle, pose=[0.0, 0.0, 0.0, *quaternion], rotation="euler_zyx")
+    assert found.status is Status.OK
+    assert found.reasons == ((Reason.PITCH_NEAR_90,) if abs(degrees) > 80.0 else ())
+    # Of the angles that mean this rotation one triple is taken, and means it still.
+    again = euler_zyx_to_quaternion(found.chart.point(found.pose.to_array())[3:])
+    assert abs(again @ quaternion) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_bounds_across_half_a_turn_hold_the_rotation_from_both_sides(bundle):
+    for yaw in (179.0, -179.0):
+        quaternion = euler_zyx_to_quaternion(np.deg2rad([0.0, 0.0, yaw]))
+        pose = [0.0, 0.0, 0.0, *quaternion]
+        angles = np.deg2rad([0.0, 0.0, yaw])
+        lower, upper = ([10.0 * by] * 3 + list(angles + by) for by in (-0.1, 0.1))
+        found = step(
+            bundle, pose=pose, lower=lower, upper=upper, q_hat=(0.0,) * 6, rotation="euler_zyx"
+        )
+        for other in (178.0, 179.9, -179.9, -178.0):
+            truth = euler_zyx_to_quaternion(np.deg2rad([0.0, 0.0, other]))
+            assert found.contains(np.array([0.0, 0.0, 0.0, *truth]))
+        opposite = euler_zyx_to_quaternion([0.0, 0.0, 0.0])
+        assert not found.contains(np.array([0.0, 0.0, 0.0, *opposite]))
 
 
 def test_an_emptied_set_becomes_its_middle_and_says_so(bundle):

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cvo_edge import Frame, Odometer, Reason, Status, open_source
 from cvo_edge.checks import Look, StreamChecks, image_doubt
@@ -128,3 +130,35 @@ def test_a_frame_with_two_faults_names_both(images):
         Reason.FRAME_REPEATED,
         Reason.STAMP_NOT_LATER,
     )
+
+
+@given(
+    stamps=st.lists(
+        st.none()
+        | st.integers(0, 5)
+        | st.sampled_from([-(2**63), 2**63 - 1, 1_764_000_000_000_000_000])
+    )
+)
+def test_a_stamp_is_doubted_exactly_where_it_is_not_after_the_last_one(stamps):
+    checks, last = StreamChecks(), None
+    for stamp_ns in stamps:
+        doubts = checks.doubts(None, stamp_ns, 0.0)
+        backward = stamp_ns is not None and last is not None and stamp_ns <= last
+        assert doubts == ((Reason.STAMP_NOT_LATER,) if backward else ())
+        # A clock that was set back counts from there: one frame, not an hour of them.
+        last = last if stamp_ns is None else stamp_ns
+
+
+def test_a_gap_costs_the_missing_frames_only(bundle_dir, images):
+    frames = [
+        Frame(images[0], 0, "", 0.0),
+        Frame(images[1], 3_600_000_000_000, "", 0.0, skipped=7),
+        Frame(images[2], 3_600_033_000_000, "", 0.0),
+    ]
+    with Odometer.load(bundle_dir, threads=1) as odometer:
+        found = list(odometer.stream(frames))
+    assert [(e.seq, e.status) for e in found] == [
+        (0, Status.OK),
+        (8, Status.OK),
+        (9, Status.OK),
+    ]
