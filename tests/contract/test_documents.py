@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from cvo_edge import Reason, errors
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -37,3 +39,12 @@ def test_the_page_on_speed_has_every_table_as_measured() -> None:
     assert expected
     for table in expected:
         assert table.strip() in found, f"expected in docs/performance.md:\n{table}"
+
+
+def test_every_reason_and_every_exit_code_is_explained() -> None:
+    rows = re.findall(
+        r"^\| `?([a-z0-9_, ]+)`? \|", (ROOT / "docs" / "faults.md").read_text("utf-8"), re.MULTILINE
+    )
+    assert {row for row in rows if "_" in row} == {reason.value for reason in Reason}
+    codes = {str(error.exit_code) for error in errors.CvoError.__subclasses__()}
+    assert {row for row in rows if row.isdigit()} == codes | {"0", "1"}
