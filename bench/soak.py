@@ -2,8 +2,8 @@
 
     python bench/soak.py [FRAMES]
 
-The demonstration's frames again and again through all that ``cvo-edge run`` consists of: odometer,
-records, summary, with ground truth. Memory is read a hundred times; growth is what the last tenth
+The demonstration's frames again and again, each time followed by a black and an unreadable one,
+through all that ``cvo-edge run`` consists of: odometer, records, summary, with ground truth. Memory is read a hundred times; growth is what the last tenth
 has more than the second, as the first fills buffers of a bounded size.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -34,13 +35,15 @@ CLIP = ARTIFACTS / "synthetic-room-clip"
 
 
 class Cycled:
-    """Decoded frames of the clip again and again, as a source."""
+    """Decoded frames of the clip and two faulty ones again and again, as a source."""
 
     live = False
 
     def __init__(self, length: int) -> None:
         self.length = length
-        self._frames = list(open_source(str(CLIP)))
+        clip = list(open_source(str(CLIP)))
+        black = np.zeros_like(clip[0].image)
+        self._frames = [*clip, replace(clip[0], image=black), replace(clip[0], image=None)]
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames."""
@@ -81,6 +84,7 @@ def main() -> None:
 
     results = {
         "frames": summary.frames,
+        "statuses": dict(summary.statuses),
         "growth_mib": {key: growth(key) for key in ("rss", "anonymous")},
         "growth": {key: growth(key) for key in ("descriptors", "threads")},
         "first": readings[0],

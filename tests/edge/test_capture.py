@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -91,6 +92,30 @@ def test_a_stream_that_hangs_or_ends_is_opened_again_and_goes_on(network_camera,
     assert [name for name, _ in seen] == [f"{camera.address}#{number}" for number in range(60)]
     problems = [record.getMessage() for record in caplog.records]
     assert ["within 0.5 s, found none" in problems[0], "found its end" in problems[1]] == [True] * 2
+
+
+def open_files():
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_what_was_given_up_leaves_neither_threads_nor_files(network_camera):
+    camera = network_camera(*[(5, 0.0)] * 8, (1000, 0.0))
+    threads, files = threading.active_count(), open_files()
+    source = open_source(camera.address, timeout_s=0.5)
+    for number, _ in enumerate(source):
+        if number == 50:
+            break
+    source.stop()
+    assert camera.connections == 9
+    camera.close()
+    deadline = time.monotonic() + 20.0
+    while time.monotonic() < deadline and (
+        threading.active_count() > threads or open_files() > files
+    ):
+        time.sleep(0.05)
+    # The camera's own listening socket is closed, too.
+    assert threading.active_count() <= threads
+    assert open_files() <= files
 
 
 def test_a_camera_that_is_gone_is_given_up_after_bounded_attempts(network_camera, caplog):
