@@ -3,8 +3,10 @@
     python bench/soak.py [FRAMES]
 
 The demonstration's frames again and again, each time followed by a black and an unreadable one,
-through all that ``cvo-edge run`` consists of: odometer, records, summary, with ground truth. Memory is read a hundred times; growth is what the last tenth
-has more than the second, as the first fills buffers of a bounded size.
+through all that ``cvo-edge run`` consists of: odometer, records, summary, with ground truth.
+
+Memory is read a hundred times; growth is what the last tenth has more than the second, as the first
+fills buffers of a bounded size.
 """
 
 from __future__ import annotations

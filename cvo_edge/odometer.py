@@ -87,7 +87,9 @@ class Odometer:
     """Pose intervals from camera images, by one bundle.
 
     One instance serves one stream: it numbers the frames. Use it as a context manager, or call
-    ``close``.
+    ``close``. Several threads may step one instance. A process that was forked from the one that
+    loaded it has to load its own (UsageError), and to end by ``os._exit``, as those of
+    ``multiprocessing`` do: onnxruntime does not let it end otherwise.
 
     Parameters
     ----------

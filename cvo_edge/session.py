@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import onnxruntime
@@ -132,6 +133,27 @@ def cores_of_threads(threads: int) -> list[int]:
     return cores if threads == len(cores) else []
 
 
+# Of this process, whichever thread holds them.
+_OPEN: WeakSet[Session] = WeakSet()
+
+
+def _abandon() -> None:
+    """Give up the sessions of the process that this one was forked from.
+
+    Their threads were not forked with them: to run one may wait for ever, and so does to end one,
+    in a destructor, which is why these objects are never freed.
+    """
+    import ctypes
+
+    for session in _OPEN:
+        session.forked = True
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_abandon)
+
+
 class Session:
     """One loaded model.
 
@@ -156,6 +178,8 @@ class Session:
         The bare ``onnxruntime.InferenceSession``, for benchmarks beside it.
     inputs, outputs
         What the model itself declares.
+    forked
+        Whether this is a process that was forked from the one that loaded it, where it cannot run.
 
     Raises
     ------
@@ -228,9 +252,19 @@ class Session:
             _compare("inputs", expected.inputs, self.inputs)
             _compare("outputs", expected.outputs, self.outputs)
         self._names = [spec.name for spec in self.outputs]
+        self.forked = False
+        _OPEN.add(self)
 
     def run(self, feeds: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.float32]]:
-        """Input arrays by name -> output arrays by name; raises ModelError where it fails."""
+        """Input arrays by name -> output arrays by name.
+
+        Raises ModelError where it fails, and UsageError in a process forked from its own.
+        """
+        if self.forked:
+            raise UsageError(
+                "session: expected the process that loaded the model, found one forked from it; "
+                "load it there"
+            )
         try:
             values = self._call(feeds)
         except Exception as error:

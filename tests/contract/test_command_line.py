@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cvo_edge import Odometer, open_source
+from cvo_edge import Odometer, open_source, read_records
 
 CVO_EDGE = [sys.executable, "-c", "from cvo_edge.cli import main; main()"]
 # Whoever runs the suite in the background of a script has it ignore SIGINT, and its children too.
@@ -155,6 +156,32 @@ def test_killed_without_warning_loses_no_acknowledged_record(bundle_dir, clip_di
     assert json.loads(first)["seq"] == 0
     complete = rest.decode().splitlines()[: rest.count(b"\n")]
     assert [json.loads(line)["seq"] for line in complete] == list(range(1, len(complete) + 1))
+
+
+@pytest.mark.parametrize("format", ["jsonl", "csv"])
+def test_a_disk_that_fills_up_within_a_line_keeps_every_line_before_it(
+    bundle_dir, clip_dir, tmp_path, format
+):
+    output, limit = tmp_path / "records", 9000
+
+    def small_disk():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    result = cvo_edge(
+        *("run", bundle_dir, clip_dir, "-o", output, "--format", format, "--no-cache", "--quiet"),
+        preexec_fn=small_disk,
+    )
+    assert str(output) in refused(result, 7)
+    content = output.read_bytes()
+    assert 0 < len(content) <= limit
+    whole = cvo_edge("run", bundle_dir, clip_dir, "--format", format, "--quiet").stdout.splitlines()
+    kept = content.decode().splitlines()[: content.count(b"\n")]
+    assert len(kept) > 5
+    if format == "jsonl":
+        names = [record.source for record in read_records(output)]
+        assert names == [json.loads(line)["source"] for line in whole[: len(kept)]]
+    else:
+        assert [line.count(",") for line in kept] == [whole[0].count(",")] * len(kept)
 
 
 def test_closed_or_full_standard_output_is_exit_7(bundle_dir):

@@ -1,6 +1,8 @@
 """The loop, on the demonstration bundle."""
 
 import gc
+import subprocess
+import sys
 import threading
 from itertools import pairwise
 
@@ -125,3 +127,46 @@ def test_results_do_not_share_memory_with_later_frames(bundle_dir, frames):
     gc.collect()
     np.testing.assert_array_equal(first.lower, kept[0])
     np.testing.assert_array_equal(first.pose.t_m, kept[1])
+
+
+FORKED = """
+import os, sys
+from cvo_edge import Odometer, UsageError, open_source
+
+bundle, clip, what = sys.argv[1:]
+odometer = Odometer.load(bundle, threads=2)
+image = next(iter(open_source(clip))).image
+first = odometer.step(image)
+child = os.fork()
+if child == 0:
+    try:
+        if what == "step":
+            odometer.step(image)
+        elif what == "close":
+            odometer.close()
+        else:
+            with Odometer.load(bundle, threads=2) as own:
+                again = own.step(image)
+            assert again.pose.to_array().tolist() == first.pose.to_array().tolist()
+    except UsageError as error:
+        print(error, flush=True)
+        os._exit(2)
+    os._exit(0)
+_, status = os.waitpid(child, 0)
+assert odometer.step(image).pose is not None
+odometer.close()
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+
+
+@pytest.mark.parametrize(("what", "code"), [("step", 2), ("close", 0), ("load", 0)])
+def test_a_forked_process_loads_its_own(bundle_dir, clip_dir, what, code):
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED, bundle_dir, clip_dir, what],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == code, done.stderr
+    assert ("found one forked from it" in done.stdout) == (what == "step")
