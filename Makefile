@@ -45,7 +45,8 @@ demo-%: $(DEMO_VENV)/.installed
 
 # Another release of OpenCV, for the tests that compare what both make of the same files.
 .opencv4: $(VENV)/.installed
-	$(VENV)/bin/python -m pip install --quiet --no-deps --target $@ opencv-python-headless==4.10.0.84
+	$(VENV)/bin/python -m pip install --quiet --no-deps --upgrade --target $@ opencv-python-headless==4.10.0.84
+	@touch $@
 
 test: $(VENV)/.installed .opencv4
 	$(VENV)/bin/python -m pytest

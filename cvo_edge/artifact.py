@@ -7,12 +7,10 @@ the format key by key; every refusal here is one line that names the key and the
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 import os
 import re
-import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,12 +20,10 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta, Struct
 
-from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, ModelError
+from cvo_edge.errors import BundleMismatchError, CalibrationFileError, ModelError
+from cvo_edge.files import read_regular_file, regular_file
 from cvo_edge.pose import Rotation, Scope
 from cvo_edge.preprocess import Crop
-
-# What else may speak against a bundle: its folder, its name, the bytes of its calibration.json.
-Check = Callable[[Path, str, bytes], None]
 
 SCHEMA_VERSION = 1
 CALIBRATION_FILE = "calibration.json"
@@ -40,9 +36,9 @@ CONFIDENCES = (0.5, 0.8, 0.9, 0.95, 0.99)
 
 # No control characters and no lone surrogates: texts are printed on terminals.
 Text = Annotated[
-    str, Meta(min_length=1, max_length=200, pattern="^[^\x00-\x1f\x7f-\x9f\ud800-\udfff]+$")
+    str, Meta(min_length=1, max_length=200, pattern="^[^\x00-\x1f\x7f-\x9f\ud800-\udfff]+$(?!\n)")
 ]
-Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$(?!\n)")]
 Positive = Annotated[float, Meta(gt=0)]
 Six = tuple[float, float, float, float, float, float]
 SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
@@ -133,7 +129,7 @@ class Threshold(_Strict, frozen=True):
     for all others ``q_hat_upper`` is null as a whole.
     """
 
-    confidence: Annotated[float, Meta(gt=0, lt=1)]
+    confidence: Annotated[float, Meta(gt=0, le=1 - 1e-9)]
     scope: Scope
     q_hat: SixOrUnbounded
     q_hat_upper: SixOrUnbounded | None
@@ -241,6 +237,9 @@ class Bundle:
     model_bytes: bytes
 
 
+# What else may speak against a bundle: its folder, its calibration, the bytes it was read from.
+Check = Callable[[Path, Calibration, bytes], None]
+
 # -- reading ------------------------------------------------------------------------------------
 
 
@@ -268,7 +267,7 @@ def read_bundle(folder: Path, check: Check | None = None) -> Bundle:
 def check_model_file(folder: Path, calibration: Calibration) -> None:
     """Raise as ``read_bundle`` where a model file is not the calibrated one, keeping none of it."""
     path = folder / MODEL_FILE
-    with _regular_file(path, ModelError) as stream:
+    with regular_file(path, MAX_MODEL_BYTES, ModelError) as stream:
         try:
             found = hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError as failure:
@@ -289,13 +288,14 @@ def read_calibration(folder: Path, check: Check | None = None) -> Calibration:
 
     Raises CalibrationFileError, and what a ``check`` raises.
     """
-    if not folder.is_dir():
+    # Not is_dir(): a name that is too long is none, either.
+    if not os.path.isdir(folder):  # noqa: PTH112
         raise CalibrationFileError(f"{folder}: expected a bundle folder, found none")
     path = folder / CALIBRATION_FILE
     content = read_regular_file(path, MAX_CALIBRATION_BYTES, CalibrationFileError)
     calibration = decode_calibration(content, str(path))
     if check is not None:
-        check(folder, calibration.name, content)
+        check(folder, calibration, content)
     return calibration
 
 
@@ -323,34 +323,6 @@ def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibra
     return calibration
 
 
-def read_regular_file(path: Path, limit: int, error: type[CvoError]) -> bytes:
-    """All bytes of a regular file of at most ``limit`` bytes; else raises the error."""
-    with _regular_file(path, error) as stream:
-        try:
-            content = stream.read(limit + 1)
-        except OSError as failure:
-            raise error(f"{path}: cannot be read: {failure.strerror}") from None
-    if len(content) > limit:
-        raise error(f"{path}: expected at most {limit} bytes, found more")
-    return content
-
-
-def _regular_file(path: Path, error: type[CvoError]) -> io.BufferedReader:
-    """Open a regular file; links and FIFOs are not opened."""
-    try:
-        # O_NONBLOCK: opening a FIFO that nobody writes to must not hang before fstat refuses it.
-        flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-        descriptor = os.open(path, flags)
-    except FileNotFoundError:
-        raise error(f"{path}: expected a file, found none") from None
-    except OSError as failure:
-        raise error(f"{path}: expected a readable regular file: {failure.strerror}") from None
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise error(f"{path}: expected a regular file, found another kind")
-    return io.BufferedReader(io.FileIO(descriptor))
-
-
 def _parse_json(content: bytes) -> dict[str, Any]:
     """Strict JSON: UTF-8 without BOM, one object, no duplicate key, every number finite."""
     if content.startswith(b"\xef\xbb\xbf"):
@@ -374,6 +346,11 @@ def _parse_json(content: bytes) -> dict[str, Any]:
             f"expected JSON, found an error in line {error.lineno} column {error.colno}: "
             f"{error.msg}"
         ) from None
+    try:
+        # JSON can say half of a surrogate pair, which nobody can print.
+        json.dumps(document, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise CalibrationFileError("expected characters, found half of one") from None
     if not isinstance(document, dict):
         raise CalibrationFileError(f"expected one JSON object, found {type(document).__name__}")
     return document

@@ -29,7 +29,7 @@ from cvo_edge.profile import (
     waited_for_cores_s,
 )
 from cvo_edge.session import Session
-from cvo_edge.sources import Frame, open_source
+from cvo_edge.sources import Frame, names_camera, open_source
 
 # A common camera's frame, used where no source is given, and its rate.
 _DEFAULT_HEIGHT, _DEFAULT_WIDTH = 480, 640
@@ -264,11 +264,13 @@ class _Endless:
     def __init__(self, source: str | None) -> None:
         self.still = source is None
         self._source = source
-        self.live = source is not None and open_source(source).live
+        self.live = source is not None and names_camera(source)
+        # Whoever asks again goes on: many a camera serves one client, once.
+        self._numbered = enumerate(self._again())
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield a call for each frame; those of files have the stamps of a steady camera."""
-        for seq, read in enumerate(self._again()):
+        for seq, read in self._numbered:
             yield read if self.live else partial(_stamped, read, round(seq * 1e9 / _LIVE_FPS))
 
     def __iter__(self) -> Iterator[Frame]:

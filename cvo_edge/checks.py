@@ -72,8 +72,9 @@ class StreamChecks:
     ) -> tuple[Reason, ...]:
         """Compare a frame with those before it, and remember it; no look where it is no image.
 
-        A camera's noise never repeats: the same image again is the old one (compared as the model
-        sees it). Another size than the first frame's is another camera, or another setting of it.
+        A sensor's noise never repeats: the same image again is the old one, or an encoder's copy
+        of it (compared as the model sees it). Another size than the first frame's is another
+        camera, or another setting of it.
         """
         doubts: tuple[Reason, ...] = ()
         if look is not None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import os
 import signal
 import sys
 import threading
+import time
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType
@@ -60,8 +62,19 @@ class FormatName(StrEnum):
     TABLE = "table"
 
 
+# How long a signal may take by the ordinary way, which closes what is open.
+_PATIENCE_S = 0.8
+# Threads that read, of cameras and videos, and of files beside each other.
+_LEFT_BEHIND = ("cvo-edge reader", "cvo-edge worker")
+# A thousand years of a camera; as many times as fit into memory.
+MOST_FRAMES, MOST_MEASURED = 10**12, 10**7
+
+# readable: what cannot be read has an exit code of ours.
 BundleArgument = Annotated[
-    Path, typer.Argument(help="Folder with model.onnx and calibration.json.", show_default=False)
+    Path,
+    typer.Argument(
+        help="Folder with model.onnx and calibration.json.", readable=False, show_default=False
+    ),
 ]
 ThreadsOption = Annotated[
     int | None, typer.Option(help="Cores to use; all allowed ones by default.")
@@ -75,7 +88,9 @@ CacheOption = Annotated[
 PublicKeyOption = Annotated[
     Path | None,
     typer.Option(
-        help="Ed25519 key (PEM): take a bundle only if it is signed with it.", show_default=False
+        help="Ed25519 key (PEM): take a bundle only if it is signed with it.",
+        readable=False,
+        show_default=False,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -107,14 +122,18 @@ def run(
         ),
     ] = None,
     threads: ThreadsOption = None,
-    max_frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many.")] = None,
+    max_frames: Annotated[
+        int | None, typer.Option(min=1, max=MOST_FRAMES, help="Stop after so many.")
+    ] = None,
     fps: Annotated[float | None, typer.Option(help="Stamp frames at this rate from zero.")] = None,
     timeout: Annotated[
         float, typer.Option(help="Seconds to wait for the next frame of a camera or video.")
     ] = 5.0,
     ground_truth: Annotated[
         Path | None,
-        typer.Option(help="TUM file or folder of .pose.txt; the summary then shows coverage."),
+        typer.Option(
+            help="TUM file or folder of .pose.txt; the summary then shows coverage.", readable=False
+        ),
     ] = None,
     region: Annotated[
         bool,
@@ -132,7 +151,7 @@ def run(
     from cvo_edge.sources import open_source
     from cvo_edge.trajectory import open_ground_truth
 
-    _refuse_overwriting(output, Path(source), ground_truth, bundle)
+    _refuse_overwriting(output, source, ground_truth, bundle, public_key)
     truth = open_ground_truth(ground_truth) if ground_truth else None
     frames = open_source(source, fps, timeout)
     with Odometer.load(
@@ -162,7 +181,7 @@ def run(
                 )
             finally:
                 if not quiet and summary.frames:
-                    print(*summary.lines(), sep="\n", file=sys.stderr)
+                    _say("\n".join(summary.lines()))
     if summary.statuses["invalid"] == summary.frames:
         raise SourceError(
             f"{source}: expected at least one valid frame, found none in {summary.frames}"
@@ -175,8 +194,10 @@ def bench(
     source: Annotated[
         str | None, typer.Argument(help="As for run; a still 640x480 image by default.")
     ] = None,
-    frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 200,
-    warmup: Annotated[int, typer.Option(min=0, help="Frames before those.")] = 20,
+    frames: Annotated[int, typer.Option(min=1, max=MOST_MEASURED, help="Frames that count.")] = 200,
+    warmup: Annotated[
+        int, typer.Option(min=0, max=MOST_MEASURED, help="Frames before those.")
+    ] = 20,
     mode: Annotated[
         ModeName, typer.Option(help="As for run; live plays files at 30 frames a second.")
     ] = ModeName.LATENCY,
@@ -195,6 +216,8 @@ def bench(
     """Measure latency, memory and processor time, beside the bare model call."""
     from cvo_edge.benchmark import benchmark, benchmark_lines
 
+    if json_file is not None:
+        _refuse_overwriting(json_file, source, bundle)
     report = benchmark(
         bundle,
         source,
@@ -221,7 +244,7 @@ def verify(
     threads: ThreadsOption = None,
     public_key: PublicKeyOption = None,
     timeout: Annotated[
-        float, typer.Option(min=0.1, max=86400, help="Seconds that loading and self-test may take.")
+        float, typer.Option(help="Seconds that loading and self-test may take.")
     ] = 60.0,
 ) -> None:
     """Check every digest of a bundle, load it and run its self-test on this machine.
@@ -327,17 +350,16 @@ def _root(
     """Options that need no command."""
 
 
-def _refuse_overwriting(output: str, *inputs: Path | None) -> None:
-    """Raise UsageError where the output file is one of the inputs or lies in the bundle."""
+def _refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
+    """Raise UsageError where the output is one of the inputs, or lies in one or behind its glob."""
     written = Path(output)
-    if output == "-" or not written.exists():
+    if output == "-" or not os.path.exists(written):  # noqa: PTH110 - also of a name too long
         return
     for given in inputs:
-        if (
-            given is not None
-            and given.exists()
-            and (written.samefile(given) or any(written.samefile(p) for p in given.glob("*")))
-        ):
+        if given is None:
+            continue
+        files = [given, *glob.iglob(str(given)), *glob.iglob(os.path.join(given, "*"))]  # noqa: PTH118
+        if any(os.path.exists(file) and written.samefile(file) for file in files):  # noqa: PTH110
             raise UsageError(f"output: expected a file of its own, found {output} among the input")
 
 
@@ -360,6 +382,10 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
     through here.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    if sys.stdout is not None:
+        # A terminal of another character set is told what it can show.
+        with contextlib.suppress(AttributeError):
+            sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     command = get_command(app)
     try:
         if sys.stdout is None:
@@ -382,7 +408,11 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
         code = 128 + signal.SIGINT
     except Terminated:
         code = 128 + signal.SIGTERM
+    except MemoryError:
+        code = _complain(program, "expected memory for what was asked, found none", 1)
     except Exception as error:
+        if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
+            _leave(_complain(program, "expected threads to work with, found none", 1))
         # A module in C that is being initialised makes an error of its own of what a signal raises.
         if _terminated.is_set():
             code = 128 + signal.SIGTERM
@@ -406,13 +436,17 @@ def _leave(code: int) -> NoReturn:
     """End the process, also where a thread waits for a camera that gives no more frames.
 
     Python would end such a thread inside OpenCV, which takes the process with it, exit code and
-    all. Everything of ours is written by now.
+    all, or wait for it. Everything of ours is written by now.
     """
-    if any(thread.name == "cvo-edge reader" for thread in threading.enumerate()):
-        for stream in (sys.stdout, sys.stderr):
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        try:
             if stream is not None:
-                with contextlib.suppress(OSError, ValueError):
-                    stream.flush()
+                stream.flush()
+        except (OSError, ValueError):
+            # Or Python tries again, fails, and has an exit code of its own for that.
+            setattr(sys, name, None)
+    if any(thread.name.startswith(_LEFT_BEHIND) for thread in threading.enumerate()):
         os._exit(code)
     sys.exit(code)
 
@@ -420,9 +454,15 @@ def _leave(code: int) -> NoReturn:
 def _complain(program: str, message: str, code: int) -> int:
     """One line on stderr, whatever a path or a key in the message holds."""
     shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
-    if sys.stderr is not None:
-        print(f"{program}: {shown}", file=sys.stderr)
+    _say(f"{program}: {shown}")
     return code
+
+
+def _say(text: str) -> None:
+    """Print to stderr; where nobody can read it, the exit code is what is left to say."""
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError, ValueError):
+            print(text, file=sys.stderr, flush=True)
 
 
 def _drop_stdout() -> None:
@@ -442,6 +482,50 @@ def _terminate(number: int, _: FrameType | None) -> NoReturn:
     raise Terminated(128 + number)
 
 
+def _within_a_second() -> None:
+    """Have SIGINT and SIGTERM end this process soon, also where no handler of Python's can run.
+
+    An inference without end, a picture of many passes, a file that is not given: while C is at
+    work, Python waits. Every finished record is on its way to the disk by then.
+    """
+    receiver, sender = os.pipe()
+    os.set_blocking(sender, False)
+    signal.set_wakeup_fd(sender)
+
+    def watch() -> None:
+        while True:
+            (number,) = os.read(receiver, 1)
+            if number in (signal.SIGINT, signal.SIGTERM):
+                time.sleep(_PATIENCE_S)
+                os._exit(128 + number)
+
+    with contextlib.suppress(RuntimeError):  # without a thread it is as it was
+        threading.Thread(target=watch, name="cvo-edge signals", daemon=True).start()
+
+
+def _apart_from_libraries() -> None:
+    """Leave stderr to us: decoders and engines in C write there what they think of their input."""
+    # Whoever started us without one of the first three would have a file of ours there.
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    if sys.stderr is None:
+        return
+    own = os.dup(2)
+    sys.stderr = os.fdopen(own, "w", buffering=1, errors="backslashreplace")
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    os.close(null)
+
+
 def main() -> NoReturn:
-    """Entry point of ``cvo-edge``."""
+    """Run ``cvo-edge``."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    # Behind our own check of image headers OpenCV's, which asks when it is imported.
+    os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = str(1 << 26)
+    _apart_from_libraries()
+    _within_a_second()
     guarded("cvo-edge", app)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cvo_edge.artifact import Calibration, Threshold
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError
-from cvo_edge.heads import Head
+from cvo_edge.heads import HEADS, Head
 
 # Thresholds are stored with all digits; comparing scores and back again costs the last ones.
 _ROUNDING = 1e-9
@@ -12,19 +12,26 @@ _ROUNDING = 1e-9
 _SIDES = ("q_hat", "q_hat_upper")
 
 
-def check_consistency(calibration: Calibration, head: Head) -> None:
-    """Refuse a bundle whose tensors or thresholds its own method cannot have given.
+def consistent_head(calibration: Calibration) -> Head:
+    """Return the head of a calibration, unless its method cannot have given what it says.
 
     Raises
     ------
     BundleMismatchError
         The model does not have the tensors that the method works with.
     CalibrationFileError
-        A threshold of the joint scope is smaller than it can be.
+        There is no such method, its parameters do not fit it, or a threshold of the joint scope is
+        smaller than it can be.
     """
+    if calibration.method not in HEADS:
+        raise CalibrationFileError(
+            f"method: expected one of {', '.join(HEADS)}, found {calibration.method}"
+        )
+    head = HEADS[calibration.method](calibration)
     _check_tensors(calibration, head)
     if not head.one_joint_score:
         _check_joint(calibration.thresholds, head)
+    return head
 
 
 def _check_tensors(calibration: Calibration, head: Head) -> None:

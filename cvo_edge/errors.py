@@ -18,6 +18,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+_LONGEST = 1000
+
 
 class CvoError(Exception):
     """Base of every error this package raises on purpose.
@@ -29,6 +31,10 @@ class CvoError(Exception):
     """
 
     exit_code: ClassVar[int] = 1
+
+    def __init__(self, message: str) -> None:
+        # What was found may be a megabyte in one line.
+        super().__init__(message if len(message) <= _LONGEST else f"{message[: _LONGEST - 3]}...")
 
 
 class UsageError(CvoError):

@@ -12,7 +12,6 @@ import contextlib
 import json
 import os
 import resource
-import signal
 import subprocess
 import sys
 import traceback
@@ -28,9 +27,11 @@ from cvo_edge.errors import (
     UsageError,
 )
 
-TIMEOUT_S = 60.0
+TIMEOUT_S, SHORTEST_S, LONGEST_S = 60.0, 0.1, 86400.0
 # What a process needs before there is a model, and what onnxruntime makes of a byte of one.
 _BASE_BYTES, _PER_MODEL_BYTE = 1 << 30, 8
+# A thread's, where the system has no limit for it.
+_STACK_BYTES = 8 << 20
 # A pipe takes 64 KiB without a reader.
 _LONGEST_ANSWER, _LONGEST_DEFECT = 1 << 16, 8000
 
@@ -68,12 +69,16 @@ def verify_bundle(
         As ``read_bundle`` and ``Odometer``.
     ModelError
         As well where loading and self-test took longer than ``timeout_s`` seconds, more memory than
-        1 GiB and eight times the model's size, or the process itself.
+        1 GiB, eight times the model's size and its threads' stacks, or the process itself.
     GateError
         The model computes something else than what was calibrated.
     UsageError
-        ``threads`` is out of range.
+        ``threads`` or ``timeout_s`` is out of range.
     """
+    if not SHORTEST_S <= timeout_s <= LONGEST_S:
+        raise UsageError(
+            f"timeout: expected {SHORTEST_S:g} to {LONGEST_S:g} s, found {timeout_s:g}"
+        )
     receiver, sender = os.pipe()
     # All there is once the process has ended, whoever else may hold the other end.
     os.set_blocking(receiver, False)
@@ -95,6 +100,10 @@ def verify_bundle(
                 stderr=subprocess.DEVNULL,
                 pass_fds=(sender,),
             )
+        except OSError as error:
+            raise ModelError(
+                f"{folder}: expected a process for the self-test, found none: {error.strerror}"
+            ) from None
         finally:
             os.close(sender)
         stack.callback(process.wait)
@@ -112,7 +121,7 @@ def verify_bundle(
 
 def _judged(folder: Path, code: int, answer: bytes) -> Verdict:
     if code != 0 or not answer:
-        how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
         raise ModelError(
             f"{folder}: expected a model that loads and answers, found its process ended {how}"
         )
@@ -153,6 +162,7 @@ def _selftest(
     from cvo_edge.odometer import Odometer
     from cvo_edge.prepared import ModelCache
     from cvo_edge.selftest import check_selftest
+    from cvo_edge.session import checked_threads
 
     check = None
     if public_key is not None:
@@ -160,7 +170,7 @@ def _selftest(
 
         check = Trust.in_key(Path(public_key)).check
     content = read_bundle(Path(folder), check)
-    _limit(len(content.model_bytes), timeout_s)
+    _limit(len(content.model_bytes), checked_threads(threads), timeout_s)
     forms: list[Bundle | PreparedBundle] = [content]
     prepared = found_in(ModelCache.default(), content.calibration)
     if prepared is not None:
@@ -174,9 +184,11 @@ def _selftest(
     return Verdict(content.calibration.name, worst, content.calibration.selftest.tolerance)
 
 
-def _limit(model_bytes: int, timeout_s: float) -> None:
+def _limit(model_bytes: int, threads: int, timeout_s: float) -> None:
     """Bound this process's memory, and its processor time should nobody be left to end it."""
-    _lower(resource.RLIMIT_DATA, _BASE_BYTES + _PER_MODEL_BYTE * model_bytes)
+    stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
+    stacks = threads * (_STACK_BYTES if stack == resource.RLIM_INFINITY else stack)
+    _lower(resource.RLIMIT_DATA, _BASE_BYTES + stacks + _PER_MODEL_BYTE * model_bytes)
     _lower(resource.RLIMIT_CPU, int(timeout_s * (os.cpu_count() or 1)) + 1)
     _lower(resource.RLIMIT_CORE, 0)
     # Where the machine itself has less, this process is the first to go.

@@ -6,6 +6,7 @@ ourselves, as OpenCV can only be told a limit by the environment, before it is i
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from collections.abc import Callable
@@ -14,14 +15,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# As BGR 192 MiB; an 8K camera has half of it.
+# As BGR 192 MiB, and a few times that while some formats are decoded; an 8K camera has half of it.
 MAX_PIXELS = 1 << 26
+# Of 16-bit colours without compression, with room for what else a file holds.
+MAX_IMAGE_BYTES = 1 << 29
 
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
-_JPEG_END = b"\xff\xd9"
-_PNM = re.compile(rb"P[1-6](?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})(?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})\s")
-_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+_JPEG_END, _JPEG_SCAN = b"\xff\xd9", b"\xff\xda"
+# Each pass over a progressive picture takes as long as one picture; cameras write one, tools ten.
+_MOST_SCANS = 64
+# Markers without a length belong into data; what hides behind one is not what a decoder sees.
+_BARE = frozenset((0x01, *range(0xD0, 0xDA)))
+# Decoders differ in whether a comment ends with a carriage return: one that has it is refused.
+_GAP = rb"\s+(?:#[^\r\n]*\n\s*)*"
+_PNM = re.compile(rb"P[1-6]" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})\s")
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_TILE = 256, 257, (322, 323)
 # TIFF's 16 and 32 bit unsigned numbers.
 _TIFF_NUMBERS = {3: "H", 4: "I"}
 
@@ -31,17 +40,17 @@ def decode_image(content: bytes) -> NDArray[np.uint8] | None:
 
     JPEG, PNG, BMP, PNM, TIFF and WebP, known by their first bytes. Grey is repeated, alpha dropped,
     16 bits keep their upper eight, and the camera's own pixel order is kept (no EXIF rotation).
-    None where the header is none of these or asks for more than ``MAX_PIXELS``, and where the file
-    is not whole: some OpenCV versions decode a cut JPEG to a full-size wrong picture, so its end
-    marker is looked for first. What is altered within a JPEG's data nobody can tell: unlike PNG, it
-    has no checksum.
+    None where the header is none of these, says two things or asks for more than ``MAX_PIXELS``,
+    and where the file is not whole: some OpenCV versions decode a cut JPEG to a full-size wrong
+    picture, so its end marker is looked for first. What is altered within a JPEG's data mostly
+    passes: unlike PNG, it has no checksum.
     """
     size = image_size(content)
     if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
         return None
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), _FLAGS)
-    except cv2.error:
+    except (cv2.error, MemoryError):
         return None
     if image is None or image.shape[:2] != size:
         return None
@@ -69,14 +78,19 @@ def _jpeg(content: bytes) -> tuple[int, int] | None:
         if marker == 0xFF:  # fill
             position += 1
             continue
+        if marker in _BARE:
+            return None
         (length,) = struct.unpack_from(">H", content, position + 2)
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            if size is not None:
+                return None
             height, width = struct.unpack_from(">HH", content, position + 5)
             size = height, width
         position += 2 + length
         if marker == 0xDA:
-            # Within data 0xff is never followed by 0xd9.
-            return size if content.rfind(_JPEG_END) >= position else None
+            # Within data 0xff is never followed by either.
+            ends = content.rfind(_JPEG_END) >= position
+            return size if ends and content.count(_JPEG_SCAN) <= _MOST_SCANS else None
     return None
 
 
@@ -87,8 +101,8 @@ def _png(content: bytes) -> tuple[int, int] | None:
 
 def _bmp(content: bytes) -> tuple[int, int]:
     (header,) = struct.unpack_from("<I", content, 14)
-    # OS/2's first header has 16 bits; rows may be stored from the top: a negative height.
-    width, height = struct.unpack_from("<hh" if header == 12 else "<ii", content, 18)
+    # OS/2's first header has 16 bits; in others rows may be stored from the top: a negative height.
+    width, height = struct.unpack_from("<HH" if header == 12 else "<ii", content, 18)
     return abs(height), abs(width)
 
 
@@ -97,8 +111,11 @@ def _pnm(content: bytes) -> tuple[int, int] | None:
     return (int(found[2]), int(found[1])) if found else None
 
 
-def _tiff(content: bytes) -> tuple[int, int]:
-    """Of the first picture; tags are numbered, each with its type, count and value."""
+def _tiff(content: bytes) -> tuple[int, int] | None:
+    """Of the first picture; tags are numbered, each with its type, count and value.
+
+    None where a tag is there twice, or tiles are larger than may be decoded.
+    """
     order = "<" if content.startswith(b"II") else ">"
     (begin,) = struct.unpack_from(order + "I", content, 4)
     (count,) = struct.unpack_from(order + "H", content, begin)
@@ -106,25 +123,37 @@ def _tiff(content: bytes) -> tuple[int, int]:
     for number in range(count):
         place = begin + 2 + 12 * number
         tag, kind, _ = struct.unpack_from(order + "HHI", content, place)
-        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT):
+        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT, *_TIFF_TILE):
+            if tag in found:
+                return None
             (found[tag],) = struct.unpack_from(order + _TIFF_NUMBERS[kind], content, place + 8)
-    return found[_TIFF_HEIGHT], found[_TIFF_WIDTH]
+    tile = math.prod(found.get(tag, 1) for tag in _TIFF_TILE)
+    return (found[_TIFF_HEIGHT], found[_TIFF_WIDTH]) if tile <= MAX_PIXELS else None
 
 
 def _webp(content: bytes) -> tuple[int, int] | None:
-    kind = content[12:16]
+    """Of the picture itself, behind what an extended file has before it; None for an animation."""
     if content[8:12] != b"WEBP":
         return None
-    if kind == b"VP8 ":
-        width, height = struct.unpack_from("<HH", content, 26)
-        return height & 0x3FFF, width & 0x3FFF
-    if kind == b"VP8L":
-        (bits,) = struct.unpack_from("<I", content, 21)
-        return (bits >> 14 & 0x3FFF) + 1, (bits & 0x3FFF) + 1
-    if kind == b"VP8X":
-        width, height = (int.from_bytes(content[at : at + 3], "little") + 1 for at in (24, 27))
-        return height, width
-    return None
+    canvas, position = None, 12
+    while True:
+        kind, length = struct.unpack_from("<4sI", content, position)
+        data = position + 8
+        if kind == b"VP8X":
+            width, height = (
+                int.from_bytes(content[at : at + 3], "little") + 1 for at in (data + 4, data + 7)
+            )
+            canvas = height, width
+        elif kind == b"VP8 ":
+            width, height = struct.unpack_from("<HH", content, data + 6)
+            size = height & 0x3FFF, width & 0x3FFF
+            break
+        elif kind == b"VP8L":
+            (bits,) = struct.unpack_from("<I", content, data + 1)
+            size = (bits >> 14 & 0x3FFF) + 1, (bits & 0x3FFF) + 1
+            break
+        position = data + length + length % 2
+    return size if canvas in (None, size) else None
 
 
 _FORMATS: tuple[tuple[bytes, Callable[[bytes], tuple[int, int] | None]], ...] = (

@@ -68,17 +68,17 @@ def in_order(tasks: Iterable[Callable[[], Result]], workers: int) -> Generator[R
     a source of tasks that ends early, is raised in its place, after the results before it.
     """
     pending: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for task in _failing_last(tasks):
-                pending.append(pool.submit(task))
-                while pending and (len(pending) >= workers + AHEAD or pending[0].done()):
-                    yield pending.popleft().result()
-            while pending:
+    pool = ThreadPoolExecutor(workers, "cvo-edge worker")
+    try:
+        for task in _failing_last(tasks):
+            pending.append(pool.submit(task))
+            while pending and (len(pending) >= workers + AHEAD or pending[0].done()):
                 yield pending.popleft().result()
-        finally:
-            for waiting in pending:
-                waiting.cancel()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        # Whoever leaves does not wait for what is being read.
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _failing_last(tasks: Iterable[Callable[[], Result]]) -> Iterator[Callable[[], Result]]:

@@ -8,7 +8,9 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
+from operator import index
 from pathlib import Path
+from threading import Lock
 from time import perf_counter
 from types import TracebackType
 from typing import Any, NamedTuple, TypedDict
@@ -17,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import preprocess
-from cvo_edge.artifact import Bundle, Threshold, read_bundle
+from cvo_edge.artifact import Bundle, Calibration, Threshold, read_bundle
 from cvo_edge.checks import Look, StreamChecks, image_doubt
-from cvo_edge.consistency import check_consistency
-from cvo_edge.errors import CalibrationFileError, ModelError, UsageError
-from cvo_edge.heads import HEADS
+from cvo_edge.consistency import consistent_head
+from cvo_edge.errors import ModelError, UsageError
 from cvo_edge.loading import PreparedBundle, load_bundle
 from cvo_edge.modes import Mode, checked_mode, in_order, plan
 from cvo_edge.pose import (
@@ -44,8 +45,8 @@ Array = NDArray[np.float64]
 _STEEP_PITCH = np.deg2rad(80.0)
 # Numbers that Python looks at in less time than numpy's first call takes.
 _FEW = 64
-# Metres, radians, standard deviations, probabilities, logits: no output is near this in any unit.
-_ABSURD = 1e6
+# Metres, radians, probabilities, scales: no output is near this in any unit.
+_ABSURD = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +88,9 @@ class Odometer:
     """Pose intervals from camera images, by one bundle.
 
     One instance serves one stream: it numbers the frames. Use it as a context manager, or call
-    ``close``. Several threads may step one instance. A process that was forked from the one that
-    loaded it has to load its own (UsageError), and to end by ``os._exit``, as those of
-    ``multiprocessing`` do: onnxruntime does not let it end otherwise.
+    ``close``. Threads that ``step`` one instance wait for each other. A process that was forked
+    from the one that loaded it has to load its own (UsageError), and to end by ``os._exit``, as
+    those of ``multiprocessing`` do: onnxruntime does not let it end otherwise.
 
     Parameters
     ----------
@@ -124,16 +125,11 @@ class Odometer:
         scope: Scope = "marginal",
     ) -> None:
         calibration = bundle.calibration
-        if calibration.method not in HEADS:
-            raise CalibrationFileError(
-                f"method: expected one of {', '.join(HEADS)}, found {calibration.method}"
-            )
         self.calibration = calibration
         self.confidence = confidence
         self.scope = scope
         self.threshold = self._stored_threshold(confidence, scope)
-        self.head = HEADS[calibration.method](calibration)
-        check_consistency(calibration, self.head)
+        self.head = consistent_head(calibration)
         model = bundle.model_bytes if isinstance(bundle, Bundle) else bundle.prepared
         self.mode = checked_mode(mode)
         settings = plan(self.mode, threads)
@@ -157,6 +153,7 @@ class Odometer:
             self._limits_chart = Chart("tangent_reference", np.array(reference))
         self._limits = calibration.pose.limits
         self._stream_checks = StreamChecks()
+        self._stepping = Lock()
         self._seq = 0
 
     @classmethod
@@ -184,7 +181,13 @@ class Odometer:
             from cvo_edge.signature import Trust
 
             trust = Trust.in_key(Path(public_key))
-        check = None if trust is None else trust.check
+
+        def check(folder: Path, calibration: Calibration, content: bytes) -> None:
+            """All that can be known before the model is loaded, or prepared."""
+            consistent_head(calibration)
+            if trust is not None:
+                trust.check(folder, calibration, content)
+
         if cache is None:
             content: Bundle | PreparedBundle = read_bundle(folder, check)
         else:
@@ -247,29 +250,37 @@ class Odometer:
         Raises
         ------
         UsageError
-            After ``close``.
+            After ``close``, in a forked process, and for a stamp that is no int.
         ModelError
             onnxruntime failed.
         """
+        try:
+            stamp_ns = None if stamp_ns is None else index(stamp_ns)
+        except TypeError:
+            raise UsageError(f"stamp_ns: expected an int or None, found {stamp_ns!r}") from None
         frame = Frame(image_bgr, stamp_ns, source, read_ms)
-        return self._in_stream(self._estimate(frame, self._next_seq()))
+        # A frame is compared with the one before, so that they have to come one after the other.
+        with self._stepping:
+            return self._in_stream(self._estimate(frame, self._next_seq()))
 
     def stream(self, frames: Iterable[Frame | NDArray[Any]]) -> Generator[PoseInterval, None, None]:
         """Step through a source, or through frames or bare BGR images, lazily, in its order.
 
         The mode says how. In ``throughput`` the files of a source are also read and decoded beside
-        each other; an estimate is given once the next frame is there, so that it is not for a
-        camera. In ``live`` only the newest frame is used; the numbers of those that were left out
-        are missing in ``seq``. A recording is played by its stamps then, frames of your own come
-        when they come. Images of your own may be written over once the next one is asked for.
+        each other. In ``live``, and of a camera in every mode, only the newest frame is used; the
+        numbers of those that were left out are missing in ``seq``. A recording is played by its
+        stamps in ``live``, frames of your own come when they come. The stream's checks begin anew.
+        Images of your own may be written over once the next one is asked for.
         Raises what the source raises, and in ``live`` UsageError for a recording without stamps.
         """
-        if self.mode is Mode.THROUGHPUT:
+        self._stream_checks = StreamChecks()
+        # What a camera gives has to be taken as it comes: what is left lying is old.
+        if self.mode is Mode.LIVE or (isinstance(frames, Source) and frames.live):
+            yield from self._newest(frames)
+        elif self.mode is Mode.THROUGHPUT:
             yield from self._beside_each_other(
                 frames.reads() if isinstance(frames, Source) else map(_already_read, frames)
             )
-        elif self.mode is Mode.LIVE:
-            yield from self._newest(frames)
         else:
             yield from self._one_by_one(map(_as_frame, frames))
 
@@ -377,8 +388,7 @@ class Odometer:
         looked at one by one than by many of numpy's functions.
         """
         values = outputs["pose"][0].tolist()
-        # NaN is not below anything.
-        sensible = all(_sum_of_magnitudes(output) < _ABSURD for output in outputs.values())
+        sensible = all(map(_sensible, outputs.values()))
         if not sensible and not all(np.isfinite(output).all() for output in outputs.values()):
             return np.array(values), np.array(values[:6]), Reason.OUTPUT_NOT_FINITE
         length = math.hypot(*values[3:])
@@ -427,12 +437,13 @@ class Odometer:
         return remarks
 
 
-def _sum_of_magnitudes(output: NDArray[np.float32]) -> float:
-    if output.size <= _FEW:
-        return sum(map(abs, output.ravel().tolist()))
-    # Numbers that are each finite may have a sum that is not.
-    with np.errstate(over="ignore"):
-        return float(np.abs(output).sum())
+def _sensible(output: NDArray[np.float32]) -> bool:
+    """Whether all numbers are there and none is absurd."""
+    if output.size > _FEW:
+        return bool(np.abs(output).max() < _ABSURD)
+    values = output.ravel().tolist()
+    # NaN is in a sum wherever it is, but in a maximum only where it comes first.
+    return max(map(abs, values)) < _ABSURD and not math.isnan(sum(values))
 
 
 def _as_frame(frame: Frame | NDArray[Any]) -> Frame:

@@ -28,7 +28,7 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from cvo_edge.errors import UsageError
+from cvo_edge.folders import own_folder
 
 GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
 SEEN_FILE = "seen.json"
@@ -42,6 +42,8 @@ _ENTRY_NAME = re.compile("[0-9a-f]{32}")
 _STALE_SECONDS = 3600.0
 # A file that changed less than this ago may change again without a sign: clocks tick slowly.
 _SETTLED_NS = 2_000_000_000
+# What msgspec raises at bytes that it did not write.
+_UNDECODABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 # With these nothing is wrong with an entry: it may be read later.
 _PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EACCES)
 # Of what is kept, and of the settings it was made with; another one is another entry.
@@ -106,22 +108,9 @@ class ModelCache:
     def default(cls) -> ModelCache:
         """The cache in ``$CVO_EDGE_CACHE``, else in ``cvo-edge`` of the user's own caches.
 
-        Raises UsageError for a relative path in that variable: it would mean another folder
-        everywhere.
+        Raises UsageError for a relative path in that variable.
         """
-        named = os.environ.get(CACHE_VARIABLE)
-        if named:
-            if not Path(named).is_absolute():
-                raise UsageError(f"{CACHE_VARIABLE}: expected an absolute path, found {named!r}")
-            return cls(Path(named))
-        caches = os.environ.get("XDG_CACHE_HOME", "")
-        if Path(caches).is_absolute():
-            return cls(Path(caches) / "cvo-edge")
-        try:
-            return cls(Path("~/.cache/cvo-edge").expanduser())
-        except RuntimeError:
-            # A user without a home: a folder that cannot be made.
-            return cls(Path(os.devnull) / "cvo-edge")
+        return cls(own_folder(CACHE_VARIABLE, "XDG_CACHE_HOME", "~/.cache"))
 
     def find(self, model_sha256: str) -> Prepared | None:
         """Return the entry of a model if this machine has one and its bytes are unchanged.
@@ -140,7 +129,7 @@ class ModelCache:
                 and hashlib.sha256(graph).hexdigest() == entry.graph_sha256
                 and file_digests(folder / WEIGHTS_FILE) == entry.weights_sha256
             )
-        except msgspec.DecodeError:
+        except _UNDECODABLE:
             unchanged = False
         except OSError as error:
             if error.errno in _PASSING:
@@ -288,7 +277,7 @@ def _is_entry(folder: Path) -> bool:
 def _read_entry(folder: Path) -> Entry | None:
     try:
         return msgspec.json.decode(_content(folder / ENTRY_FILE), type=Entry)
-    except (OSError, msgspec.DecodeError):
+    except (OSError, *_UNDECODABLE):
         return None
 
 
@@ -308,7 +297,7 @@ def identity(path: Path) -> FileIdentity | None:
 def _seen(prepared: Prepared) -> list[FileIdentity]:
     try:
         return msgspec.json.decode(_content(prepared.folder / SEEN_FILE), type=list[FileIdentity])
-    except (OSError, msgspec.DecodeError):
+    except (OSError, *_UNDECODABLE):
         return []
 
 

@@ -51,8 +51,8 @@ def crop_box(
     """
     if crop == "none":
         return 0, image_height, 0, image_width
-    kept_height = min(image_height, image_width * height // width)
-    kept_width = min(image_width, image_height * width // height)
+    kept_height = max(1, min(image_height, image_width * height // width))
+    kept_width = max(1, min(image_width, image_height * width // height))
     top, left = (image_height - kept_height) // 2, (image_width - kept_width) // 2
     return top, top + kept_height, left, left + kept_width
 
@@ -92,7 +92,11 @@ def selftest_image(height: int, width: int) -> Image:
     Channel c of pixel (x, y) is ((x + 40 c)^2 + 2 y^2 + x y) // 64 mod 512, folded at 256: smooth
     rings that grow finer to the lower right, so that the resize is tested with the network.
     """
-    y, x = np.mgrid[0:height, 0:width].astype(np.int64)
-    channels = [((x + 40 * c) ** 2 + 2 * y**2 + x * y) // 64 % 512 for c in range(3)]
-    wave = np.stack(channels, axis=-1)
-    return np.where(wave < 256, wave, 511 - wave).astype(np.uint8)
+    image = np.empty((height, width, 3), np.uint8)
+    x = np.arange(width, dtype=np.int64)
+    # Row by row: all of it in 64 bits would take more memory than a model.
+    for y in range(height):
+        for c in range(3):
+            wave = ((x + 40 * c) ** 2 + 2 * y**2 + x * y) // 64 % 512
+            image[y, :, c] = np.where(wave < 256, wave, 511 - wave)
+    return image

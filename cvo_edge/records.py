@@ -80,7 +80,7 @@ def read_records(path: str | Path) -> Iterator[Record]:
                     return
                 try:
                     record = _DECODER.decode(line)
-                except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+                except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
                     raise SourceError(
                         f"{path}: expected a record in line {number}, found none: {error}"
                     ) from None

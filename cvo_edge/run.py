@@ -44,12 +44,12 @@ class RunSummary:
     compared: int = 0
     covered: Array = field(default_factory=lambda: np.zeros(6))
     covered_jointly: int = 0
-    _last_seq: int | None = None
+    # An odometer numbers its frames from 0: also the first ones may have been left out.
+    _last_seq: int = -1
 
     def add(self, estimate: PoseInterval, truth: Array | None) -> None:
         """Count one estimate; ``truth`` is its true pose (7,) where it is known."""
-        if self._last_seq is not None:
-            self.skipped += estimate.seq - self._last_seq - 1
+        self.skipped += estimate.seq - self._last_seq - 1
         self._last_seq = estimate.seq
         self.statuses[estimate.status] += 1
         self.reasons.update(estimate.reasons)

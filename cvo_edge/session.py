@@ -6,6 +6,7 @@ Bundles of another provider have their session in a file of its own, behind the 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,9 @@ from numpy.typing import NDArray
 from cvo_edge.artifact import Dtype, ModelSpec, TensorSpec
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 from cvo_edge.prepared import GRAPH_FILE, WEIGHTS_FILE, Prepared
+
+# No word of it leaves this machine.
+onnxruntime.disable_telemetry_events()
 
 MAX_THREADS = 64
 # Smaller ones stay in the graph: shapes and scales, of no size.
@@ -108,7 +112,9 @@ def saturates() -> bool:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.log_severity_level = 4
-    engine = onnxruntime.InferenceSession(_PRODUCT, options, providers=["CPUExecutionProvider"])
+    engine = onnxruntime.InferenceSession(
+        _PRODUCT, options, providers=["CPUExecutionProvider"], enable_fallback=0
+    )
     (found,) = engine.run(None, {"a": np.full((1, 32), 255, np.uint8)})
     return int(found[0, 0]) != 32 * 255 * 127
 
@@ -116,8 +122,8 @@ def saturates() -> bool:
 def checked_threads(threads: int | None) -> int:
     """Return a number of threads, by default one for each allowed core; raises UsageError."""
     # The engine would take a thousand, and minutes for a frame.
-    if threads is not None and not 1 <= threads <= MAX_THREADS:
-        raise UsageError(f"threads: expected 1 to {MAX_THREADS}, found {threads}")
+    if threads is not None and not (isinstance(threads, int) and 1 <= threads <= MAX_THREADS):
+        raise UsageError(f"threads: expected 1 to {MAX_THREADS}, found {threads!r}")
     return threads or allowed_cores()
 
 
@@ -143,8 +149,6 @@ def _abandon() -> None:
     Their threads were not forked with them: to run one may wait for ever, and so does to end one,
     in a destructor, which is why these objects are never freed.
     """
-    import ctypes
-
     for session in _OPEN:
         session.forked = True
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
@@ -231,17 +235,18 @@ class Session:
             key = "session.model_external_initializers_file_folder_path"
             options.add_session_config_entry(key, str(model.folder))
         try:
+            # Without the fallback, which says on stdout that it loads the same model once more.
             self.engine = onnxruntime.InferenceSession(
-                content, options, providers=["CPUExecutionProvider"]
+                content, options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
+            inputs, outputs = (
+                [(each.name, each.type, each.shape) for each in ports]
+                for ports in (self.engine.get_inputs(), self.engine.get_outputs())
             )
         # onnxruntime raises a dozen unrelated types here, UnicodeDecodeError among them.
         except Exception as error:
             raise ModelError(f"model.onnx: refused by onnxruntime: {one_line(error)}") from None
-        self._declare(
-            [(each.name, each.type, each.shape) for each in self.engine.get_inputs()],
-            [(each.name, each.type, each.shape) for each in self.engine.get_outputs()],
-            expected,
-        )
+        self._declare(inputs, outputs, expected)
 
     def _declare(
         self, inputs: Sequence[Port], outputs: Sequence[Port], expected: ModelSpec | None
@@ -252,6 +257,7 @@ class Session:
             _compare("inputs", expected.inputs, self.inputs)
             _compare("outputs", expected.outputs, self.outputs)
         self._names = [spec.name for spec in self.outputs]
+        self._shapes = [spec.shape for spec in self.outputs]
         self.forked = False
         _OPEN.add(self)
 
@@ -269,6 +275,13 @@ class Session:
             values = self._call(feeds)
         except Exception as error:
             raise ModelError(f"model.onnx: inference failed: {one_line(error)}") from None
+        # A model may declare one shape and give another.
+        for name, shape, value in zip(self._names, self._shapes, values, strict=True):
+            if value.shape != shape:
+                raise ModelError(
+                    f"model.onnx: expected {name} {list(shape)}, as declared, found "
+                    f"{list(value.shape)}"
+                )
         return dict(zip(self._names, values, strict=True))
 
     def _call(self, feeds: Mapping[str, NDArray[np.generic]]) -> Sequence[Any]:

@@ -24,15 +24,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from cvo_edge.artifact import Sha256, Text, read_regular_file
+from cvo_edge.artifact import Calibration, Sha256, Text
 from cvo_edge.errors import BundleMismatchError, SinkError, UsageError
+from cvo_edge.files import read_regular_file
+from cvo_edge.folders import own_folder
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 SIGNATURE_FILE = "signature.json"
+STATE_VARIABLE = "CVO_EDGE_STATE"
 _MAX_SIGNATURE_BYTES = 4096
-_MAX_KEY_BYTES = 16384
+MAX_KEY_BYTES = 16384
+_UNDECODABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 # Seconds since 1970 are versions, too, for a long time.
 HIGHEST_VERSION = 2**53
 
@@ -49,7 +53,7 @@ class Signature(Struct, frozen=True, forbid_unknown_fields=True):
     version: Annotated[int, Meta(ge=1, le=HIGHEST_VERSION)]
     calibration_sha256: Sha256
     key: Sha256
-    signature: Annotated[str, Meta(pattern="^[0-9a-f]{128}$")]
+    signature: Annotated[str, Meta(pattern="^[0-9a-f]{128}$(?!\n)")]
 
 
 def message(name: str, version: int, calibration_sha256: str) -> bytes:
@@ -81,22 +85,22 @@ class Trust:
         """The sha256 of the public key's 32 bytes."""
         return hashlib.sha256(self.key.public_bytes_raw()).hexdigest()
 
-    def check(self, folder: Path, name: str, calibration: bytes) -> None:
-        """Check the signature of these bytes of ``calibration.json``, and the bundle's version.
+    def check(self, folder: Path, calibration: Calibration, content: bytes) -> None:
+        """Check the signature of these bytes of a ``calibration.json``, and the bundle's version.
 
         Raises BundleMismatchError for a bundle that is not signed, was altered after it, is signed
         with another key, or is older than one that this device has run.
         """
         from cryptography.exceptions import InvalidSignature
 
-        path = folder / SIGNATURE_FILE
+        path, name = folder / SIGNATURE_FILE, calibration.name
         signature = _read_signature(path)
         if signature.key != self.key_sha256:
             raise BundleMismatchError(
                 f"{path}: expected a signature with the key {self.key_sha256}, found one with "
                 f"{signature.key}"
             )
-        found = hashlib.sha256(calibration).hexdigest()
+        found = hashlib.sha256(content).hexdigest()
         if (signature.calibration_sha256, signature.name) != (found, name):
             raise BundleMismatchError(
                 f"{path}: expected a signature of {name}, calibration.json with sha256 {found}, "
@@ -135,10 +139,12 @@ class Versions:
 
     @classmethod
     def default(cls) -> Versions:
-        """``versions.json`` in ``$CVO_EDGE_STATE``, or in cvo-edge's folder of the user's state."""
-        own = os.environ.get("CVO_EDGE_STATE")
-        base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-        return cls((Path(own) if own else Path(base) / "cvo-edge") / "versions.json")
+        """``versions.json`` in ``$CVO_EDGE_STATE``, or in cvo-edge's folder of the user's state.
+
+        Raises UsageError for a relative path in that variable.
+        """
+        folder = own_folder(STATE_VARIABLE, "XDG_STATE_HOME", "~/.local/state")
+        return cls(folder / "versions.json")
 
     def highest(self, key: str, name: str) -> int:
         """Return the highest version that was run, 0 if none was.
@@ -183,7 +189,7 @@ class Versions:
             ) from None
         try:
             return msgspec.json.decode(content, type=dict[str, dict[str, int]])
-        except msgspec.MsgspecError:
+        except _UNDECODABLE:
             raise BundleMismatchError(
                 f"{self.path}: expected the versions that this device has run, found something "
                 "else; without it, removed by hand, any version is taken once more"
@@ -211,7 +217,7 @@ def _read_signature(path: Path) -> Signature:
     content = read_regular_file(path, _MAX_SIGNATURE_BYTES, BundleMismatchError)
     try:
         return msgspec.json.decode(content, type=Signature, strict=True)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except _UNDECODABLE as error:
         raise BundleMismatchError(f"{path}: expected a signature, found none: {error}") from None
 
 
@@ -225,7 +231,8 @@ def _public_key(path: Path) -> Ed25519PublicKey:
             "public key: expected the extra [sign] (pip install 'cvo-edge[sign]'), found no "
             "cryptography"
         ) from None
-    content = read_regular_file(path, _MAX_KEY_BYTES, UsageError)
+    # Secrets are often mounted as links.
+    content = read_regular_file(path, MAX_KEY_BYTES, UsageError, links=True)
     try:
         key = load_pem_public_key(content)
     except (ValueError, TypeError, UnsupportedAlgorithm):

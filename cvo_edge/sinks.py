@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import math
 import os
@@ -57,8 +58,21 @@ class Sink:
                 if self._owned
                 else sys.stdout.fileno()
             )
+            self._alone()
         except OSError as error:
             raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
+
+    def _alone(self) -> None:
+        """Two writers of one file would leave neither's records whole; the lock ends with us."""
+        if not self._owned or not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
+            return
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._descriptor)
+            raise SinkError(
+                f"{self._name}: expected a file that no other run writes to, found one that does"
+            ) from None
 
     def __enter__(self) -> Sink:
         """Return itself."""
@@ -178,7 +192,9 @@ def _table_header(estimate: PoseInterval) -> bytes:
 
 
 def _table_line(estimate: PoseInterval) -> bytes:
-    name = (estimate.source or str(estimate.seq))[-25:]
+    # A file's name may move a terminal's cursor.
+    name = "".join(c if c.isprintable() else "?" for c in estimate.source or str(estimate.seq))
+    name = name[-25:]
     line = f"{name:<26}{estimate.status:<9}"
     if estimate.pose is None:
         return f"{line}  {', '.join(estimate.reasons)}\n".encode()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import logging
-import os
 import re
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
@@ -17,9 +16,10 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from numpy.typing import NDArray
 
-from cvo_edge.capture import READER, TIMEOUT_S, Capture, Grabbed
+from cvo_edge.capture import READER, TIMEOUT_S, Capture, Grabbed, shown
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.images import decode_image
+from cvo_edge.files import read_regular_file
+from cvo_edge.images import MAX_IMAGE_BYTES, decode_image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 
@@ -44,7 +44,8 @@ class Frame:
     ``image`` is (height, width, 3) uint8 BGR, or None where it could not be read whole; who makes
     frames of their own may put in whatever ``Odometer.step`` takes;
     ``stamp_ns`` is None where the source has no clock; ``read_ms`` what reading and decoding took,
-    without waiting for a camera; ``waited_ms`` how long it lay ready since; ``skipped`` how many
+    without waiting for a camera; ``waited_ms`` how long it lay ready since, or may have lain in a
+    camera's queue before; ``skipped`` how many
     frames of the source before it were left out.
     """
 
@@ -99,12 +100,14 @@ def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_
     if not 0.0 < timeout_s <= LONGEST_S:
         raise UsageError(f"timeout: expected up to {LONGEST_S:g} s, found {timeout_s:g}")
     path = Path(text)
+    try:
+        path.exists()
+    except OSError as error:
+        raise SourceError(f"{text}: cannot be looked for: {error.strerror}") from None
     if path.is_dir():
         return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
-    if text.isdecimal():
-        return Camera(int(text), fps, timeout_s)
-    if path.is_char_device() or path.is_fifo() or "://" in text:
-        return Camera(text, fps, timeout_s)
+    if names_camera(text):
+        return Camera(int(text) if text.isdecimal() else text, fps, timeout_s)
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES:
             return ImageFiles([path], fps, "")
@@ -115,6 +118,14 @@ def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_
     raise SourceError(
         f"{text}: expected a folder, glob, video file, camera index or device, found none of these"
     )
+
+
+def names_camera(text: str) -> bool:
+    """Whether frames come by themselves there: an index, a device, a named pipe or an address."""
+    path = Path(text)
+    if path.is_dir():
+        return False
+    return text.isdecimal() or path.is_char_device() or path.is_fifo() or "://" in text
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
@@ -158,6 +169,7 @@ class Video:
     def __init__(self, path: Path, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
         self._path = path
         self._capture = Capture(str(path), timeout_s)
+        self._capture.open()
         own, announced = self._capture.properties()
         self._fps = fps or (own if 0.0 < own < 1e5 else None)
         self.length: int | None = announced if announced > 0 else None
@@ -172,7 +184,7 @@ class Video:
         seq = 0
         with closing(self._capture):
             while (grabbed := self._capture.read()) is not None:
-                name = f"{self._path.name}#{seq}"
+                name = f"{shown(self._path.name)}#{seq}"
                 yield Frame(grabbed.image, _stamp(seq, self._fps), name, grabbed.read_ms)
                 seq += 1
         if self.length is not None and seq < self.length:
@@ -186,7 +198,8 @@ class Camera:
     """A camera by index, device path or address; stamps are the clock's when a frame arrived.
 
     One that does not open, or gives no frame for ``timeout_s``, is given up and opened again, a few
-    times, after ever longer pauses.
+    times, after ever longer pauses. Its frames are to be taken as they come, as
+    ``Odometer.stream`` does in every mode: what nobody takes lies in queues of drivers.
     """
 
     live = True
@@ -194,7 +207,7 @@ class Camera:
     def __init__(self, device: int | str, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
         self._device, self._fps, self._timeout_s = device, fps, timeout_s
         self._capture: Capture | None = None
-        self._failures = 0
+        self._failures = self._since_opened = 0
         self._stopped = Event()
         self.length: int | None = None
         self._insisting(self._opened)
@@ -217,16 +230,29 @@ class Camera:
                 grabbed = self._insisting(self._grabbed)
                 if grabbed is None:
                     return
+                self._since_opened += 1
+                if self._since_opened > 1:
+                    # One frame a connection is what an address of single pictures gives.
+                    self._failures = 0
                 stamp_ns = _stamp(seq, self._fps) if self._fps else grabbed.stamp_ns
-                yield Frame(grabbed.image, stamp_ns, f"{self._device}#{seq}", grabbed.decode_ms)
+                name = f"{shown(self._device)}#{seq}"
+                yield Frame(
+                    grabbed.image, stamp_ns, name, grabbed.decode_ms, waited_ms=grabbed.queued_ms
+                )
                 seq += 1
         finally:
             self._close()
 
     def _opened(self) -> Capture:
-        if self._capture is None:
-            self._capture = Capture(self._device, self._timeout_s)
-        return self._capture
+        capture = self._capture
+        if capture is None:
+            # Known before it is waited for, so that ``stop`` finds it.
+            capture = self._capture = Capture(self._device, self._timeout_s)
+            self._since_opened = 0
+            if self._stopped.is_set():
+                self._close()
+            capture.open()
+        return capture
 
     def _grabbed(self) -> Grabbed | None:
         return self._opened().read()
@@ -245,9 +271,8 @@ class Camera:
                 problem = str(error)
             else:
                 if found is not None:
-                    self._failures = 0
                     return found
-                problem = f"{self._device}: expected a frame, found its end"
+                problem = f"{shown(self._device)}: expected a frame, found its end"
             self._close()
             if self._stopped.is_set():
                 break
@@ -291,7 +316,7 @@ class Newest:
                 if frame is None:
                     break
                 waited_ms = 1e3 * (perf_counter() - ready_at)
-                yield replace(frame, waited_ms=waited_ms, skipped=skipped)
+                yield replace(frame, waited_ms=frame.waited_ms + waited_ms, skipped=skipped)
         finally:
             self._closed = True
             if self._stop is not None:
@@ -351,12 +376,12 @@ class Played:
 def _read_file(path: Path, stamp_ns: int | None) -> Frame:
     start = perf_counter()
     try:
-        image = decode_image(path.read_bytes())
-    except OSError:
+        content = read_regular_file(path, MAX_IMAGE_BYTES, SourceError, links=True)
+        image = decode_image(content)
+    except SourceError:
         image = None
     spent = 1e3 * (perf_counter() - start)
-    # A file name may be any bytes; a record is UTF-8.
-    return Frame(image, stamp_ns, os.fsencode(path.name).decode("utf-8", "replace"), spent)
+    return Frame(image, stamp_ns, shown(path.name), spent)
 
 
 def _itself(frame: Frame) -> Frame:

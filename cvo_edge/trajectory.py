@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cvo_edge import geometry
 from cvo_edge.errors import SourceError
+from cvo_edge.files import read_regular_file
 from cvo_edge.pose import PoseInterval
 
 Array = NDArray[np.float64]
@@ -20,7 +21,7 @@ MATRIX_SUFFIX = ".pose.txt"
 # Frames are matched to the nearest ground-truth stamp within this bound, that of the TUM tools.
 MAX_STAMP_DIFFERENCE_NS = 20_000_000
 
-_MAX_BYTES = 256 << 20
+_MAX_BYTES, _MAX_MATRIX_BYTES = 256 << 20, 1 << 16
 
 
 def read_pose_matrix(path: Path) -> Array | None:
@@ -30,8 +31,9 @@ def read_pose_matrix(path: Path) -> Array | None:
     there.
     """
     try:
-        T = np.array(path.read_text("ascii").split(), dtype=np.float64)
-    except (OSError, ValueError):
+        content = read_regular_file(path, _MAX_MATRIX_BYTES, SourceError, links=True)
+        T = np.array(content.decode("ascii").split(), dtype=np.float64)
+    except (SourceError, ValueError):
         return None
     return matrix_to_pose(T.reshape(4, 4)) if T.size == 16 else None
 
@@ -98,6 +100,10 @@ def open_ground_truth(path: Path) -> GroundTruth:
 
     Raises SourceError where there is no pose to be had.
     """
+    if not path.exists():
+        raise SourceError(
+            f"{path}: expected a TUM trajectory or a folder of *{MATRIX_SUFFIX}, found neither"
+        )
     if path.is_dir():
         found = {
             file.name.removesuffix(MATRIX_SUFFIX): read_pose_matrix(file)
@@ -107,18 +113,14 @@ def open_ground_truth(path: Path) -> GroundTruth:
         if not by_name:
             raise SourceError(f"{path}: expected files *{MATRIX_SUFFIX}, found no valid one")
         return GroundTruth(by_name, [], [])
-    if not path.is_file() or path.stat().st_size > _MAX_BYTES:
-        raise SourceError(
-            f"{path}: expected a TUM trajectory of at most {_MAX_BYTES >> 20} MiB or a folder of "
-            f"*{MATRIX_SUFFIX}, found neither"
-        )
     return GroundTruth({}, *_read_tum(path))
 
 
 def _read_tum(path: Path) -> tuple[list[int], list[Array]]:
     try:
-        lines = path.read_text("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        content = read_regular_file(path, _MAX_BYTES, SourceError, links=True)
+        lines = content.decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
         raise SourceError(f"{path}: expected a TUM trajectory, found {error}") from None
     stamps: list[int] = []
     poses: list[Array] = []
@@ -128,14 +130,14 @@ def _read_tum(path: Path) -> tuple[list[int], list[Array]]:
         fields = line.split()
         try:
             values = np.array(fields, dtype=np.float64)
+            stamp = seconds_to_ns(fields[0])
         except ValueError:
             values = np.empty(0)
-        if values.size != 8 or not np.isfinite(values).all() or not values[4:].any():
+        if values.size != 8 or not np.isfinite(values).all() or not _is_rotation(values[4:]):
             raise SourceError(
                 f"{path}: expected eight numbers stamp tx ty tz qx qy qz qw, found {line!r} "
                 f"in line {number}"
             )
-        stamp = seconds_to_ns(fields[0])
         if stamps and stamp <= stamps[-1]:
             raise SourceError(
                 f"{path}: expected growing stamps, found {fields[0]} in line {number}"
@@ -146,3 +148,9 @@ def _read_tum(path: Path) -> tuple[list[int], list[Array]]:
     if not stamps:
         raise SourceError(f"{path}: expected a TUM trajectory, found no line")
     return stamps, poses
+
+
+def _is_rotation(quaternion: Array) -> bool:
+    """Whether it has a length that can be divided by."""
+    with np.errstate(over="ignore"):
+        return 0.0 < float(quaternion @ quaternion) < np.inf

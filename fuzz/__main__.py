@@ -52,6 +52,9 @@ def main() -> int:
         print(f"{name}: {what}", flush=True)
         begin = time.monotonic()
         tally = trials(count)
+        if not tally.trials:
+            print(f"  nothing to try: {', '.join(tally.outcomes)}")
+            continue
         report(name, what, count, tally, time.monotonic() - begin)
         found += len(tally.findings)
     print(text := table())

@@ -39,6 +39,7 @@ def kills(count: int) -> Tally:
             time.sleep(more_s)
             # What the last look saw is what was acknowledged.
             seen = path.read_bytes().count(b"\n") if path.exists() else 0
+            ended = process.poll() is not None
             process.kill()
             process.wait()
             try:
@@ -48,6 +49,8 @@ def kills(count: int) -> Tally:
             torn = not path.read_bytes().endswith(b"\n")
             if records != list(range(len(records))) or len(records) < seen:
                 return "lost", f"{seen} records were seen, {len(records)} are there"
+            if ended:
+                return "had ended before", None
             return "torn last line" if torn else "whole", None
 
     return beside_each_other(trial, count)

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 
 _PROGRAM = "from cvo_edge.cli import main; main()"
 
@@ -86,10 +85,3 @@ def beside_each_other(trial: Callable[[int], tuple[str, str | None]], count: int
                     flush=True,
                 )
     return tally
-
-
-def put(folder: Path, name: str, content: bytes) -> Path:
-    """Write a file of a trial."""
-    path = folder / name
-    path.write_bytes(content)
-    return path

@@ -125,7 +125,7 @@ def evaluate(
             others = _Sets(odometer, seen, again, claim)
             report["recalibrated"] = {
                 "n_calibration": again.calibration.n,
-                "invalid": split.roles["cal"].size - again.calibration.n,
+                "left_out": split.roles["cal"].size - again.calibration.n,
                 "levels": others.levels(),
                 "sequences": others.sequences(dataset),
             }
@@ -268,7 +268,7 @@ def table(report: Mapping[str, Any]) -> list[str]:
         *_sequence_lines(report["sequences"]),
         "",
         f"recalibrated: thresholds of {again['n_calibration']} calibration frames with the same "
-        f"noise; invalid {again['invalid']}",
+        f"noise; left out {again['left_out']}",
         *_level_lines(report["rule"], again["levels"]),
         *_sequence_lines(again["sequences"]),
     ]

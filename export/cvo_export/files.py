@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,12 +15,16 @@ T = TypeVar("T")
 
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file, making its folder; raises SinkError."""
-    unfinished = path.with_name(path.name + ".partial")
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.write_bytes(content.encode() if isinstance(content, str) else content)
+        # Not what lies there already: it may be a link to elsewhere.
+        with unfinished.open("xb") as stream:
+            stream.write(content.encode() if isinstance(content, str) else content)
         unfinished.replace(path)
     except OSError as error:
+        if not isinstance(error, FileExistsError):
+            unfinished.unlink(missing_ok=True)
         raise SinkError(f"{path}: cannot be written: {error.strerror}") from None
 
 

@@ -10,11 +10,16 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from cvo_edge.artifact import CALIBRATION_FILE, MAX_CALIBRATION_BYTES, read_bundle
-from cvo_edge.artifact import decode_calibration as decode
-from cvo_edge.artifact import read_regular_file as read
-from cvo_edge.errors import BundleMismatchError, CalibrationFileError, UsageError
-from cvo_edge.signature import HIGHEST_VERSION, SIGNATURE_FILE, Signature, message
+from cvo_edge.artifact import Calibration, read_bundle
+from cvo_edge.errors import UsageError
+from cvo_edge.files import read_regular_file
+from cvo_edge.signature import (
+    HIGHEST_VERSION,
+    MAX_KEY_BYTES,
+    SIGNATURE_FILE,
+    Signature,
+    message,
+)
 from cvo_export.files import write_json
 
 if TYPE_CHECKING:
@@ -22,7 +27,6 @@ if TYPE_CHECKING:
 
 # An encrypted key's passphrase, in the environment: on a command line others would see it.
 PASSPHRASE = "CVO_SIGNING_PASSPHRASE"  # noqa: S105 - its name
-_MAX_KEY_BYTES = 16384
 
 
 def sign(folder: Path, key: Path, version: int | None = None) -> Signature:
@@ -51,11 +55,13 @@ def sign(folder: Path, key: Path, version: int | None = None) -> Signature:
     if not 1 <= version <= HIGHEST_VERSION:
         raise UsageError(f"version: expected 1 to {HIGHEST_VERSION}, found {version}")
     private = _private_key(key)
-    calibration = read_bundle(folder).calibration
-    content = read(folder / CALIBRATION_FILE, MAX_CALIBRATION_BYTES, CalibrationFileError)
-    if decode(content) != calibration:
-        raise BundleMismatchError(f"{folder}: expected a bundle at rest, found it being written")
-    digest = hashlib.sha256(content).hexdigest()
+    digests = []
+
+    def take(_: Path, __: Calibration, content: bytes) -> None:
+        digests.append(hashlib.sha256(content).hexdigest())
+
+    calibration = read_bundle(folder, take).calibration
+    (digest,) = digests
     signature = Signature(
         schema_version=1,
         name=calibration.name,
@@ -80,7 +86,8 @@ def _private_key(path: Path) -> Ed25519PrivateKey:
     passphrase = os.environ.get(PASSPHRASE)
     try:
         private = load_pem_private_key(
-            read(path, _MAX_KEY_BYTES, UsageError), passphrase.encode() if passphrase else None
+            read_regular_file(path, MAX_KEY_BYTES, UsageError, links=True),
+            passphrase.encode() if passphrase else None,
         )
     except TypeError:
         raise UsageError(

@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import time
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -354,3 +356,125 @@ def test_inspect_schema_doctor_and_version_answer(bundle_dir):
     assert json.loads(cvo_edge("doctor", "--json").stdout)["cores_allowed"] >= 1
     assert cvo_edge("--version").stdout.startswith("cvo-edge ")
     assert "Usage" in cvo_edge().stdout
+
+
+UNHEARD = {
+    2: ["run", "BUNDLE", "CLIP", "--confidence", "0.123"],
+    3: ["verify", "nowhere"],
+    6: ["run", "BUNDLE", "nowhere"],
+    7: ["run", "BUNDLE", "CLIP", "-o", "/dev/full"],
+    0: ["run", "BUNDLE", "CLIP", "--max-frames", "2"],
+}
+
+
+@pytest.mark.parametrize("code", UNHEARD)
+@pytest.mark.parametrize("ear", ["full", "closed", "left"])
+def test_the_exit_code_is_the_same_where_nobody_reads_stderr(bundle_dir, clip_dir, code, ear):
+    words = {"BUNDLE": str(bundle_dir), "CLIP": str(clip_dir)}
+    command = [*CVO_EDGE, *(words.get(word, word) for word in UNHEARD[code])]
+    receiver, sender = os.pipe()
+    os.close(receiver)
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            ["sh", "-c", 'exec "$@" 2>&-', "sh", *command] if ear == "closed" else command,
+            stdout=subprocess.PIPE,
+            stderr={"full": full, "closed": None, "left": sender}[ear],
+            check=False,
+        )
+    os.close(sender)
+    assert done.returncode == code
+    # Nor does what was meant for it go among the records.
+    assert all(json.loads(line)["seq"] >= 0 for line in done.stdout.splitlines())
+
+
+@pytest.mark.parametrize("command", ["run", "verify", "inspect", "bench"])
+def test_a_name_too_long_is_a_bundle_that_is_not_there(clip_dir, command):
+    source = [clip_dir] if command == "run" else []
+    refused(cvo_edge(command, "x" * 300, *source), 3)
+
+
+def test_a_name_too_long_is_no_output(bundle_dir, clip_dir):
+    refused(cvo_edge("run", bundle_dir, clip_dir, "-o", "x" * 300), 7)
+
+
+def test_more_outputs_that_are_inputs_are_refused(copied_bundle, clip_dir, tmp_path):
+    images = tmp_path / "images"
+    shutil.copytree(clip_dir, images)
+    image = min(images.glob("*.jpg"))
+    key = tmp_path / "key.pem"
+    key.write_text("a key")
+    calibration = copied_bundle / "calibration.json"
+    kept = [path.read_bytes() for path in (image, key, calibration)]
+    refused(cvo_edge("run", copied_bundle, images / "*.jpg", "-o", image), 2)
+    refused(cvo_edge("run", copied_bundle, images, "--public-key", key, "-o", key), 2)
+    refused(cvo_edge("bench", copied_bundle, "--frames", 1, "--json", calibration), 2)
+    assert [path.read_bytes() for path in (image, key, calibration)] == kept
+
+
+def test_two_runs_do_not_write_one_file(bundle_dir, clip_dir, tmp_path):
+    output = tmp_path / "records.jsonl"
+    live = [*CVO_EDGE, "run", bundle_dir, clip_dir, "-o", output, "--mode", "live", "--fps", "10"]
+    with subprocess.Popen([*map(str, live), "--quiet"]) as first:
+        while not (output.exists() and output.stat().st_size):
+            assert first.poll() is None
+            time.sleep(0.01)
+        refused(cvo_edge("run", bundle_dir, clip_dir, "-o", output), 7)
+        assert first.wait(60) == 0
+    assert [record.status for record in read_records(output)]
+    assert cvo_edge("run", bundle_dir, clip_dir, "-o", output, "--quiet").returncode == 0
+
+
+@pytest.mark.parametrize("many", ["9" * 20, "0", "-1"])
+def test_numbers_of_frames_have_bounds(bundle_dir, clip_dir, many):
+    refused(cvo_edge("run", bundle_dir, clip_dir, "--max-frames", many), 2)
+    refused(cvo_edge("bench", bundle_dir, "--frames", many), 2)
+
+
+@pytest.mark.parametrize("timeout", ["nan", "inf", "0", "-1"])
+def test_a_time_for_verify_must_be_one(bundle_dir, timeout):
+    refused(cvo_edge("verify", bundle_dir, "--timeout", timeout), 2)
+
+
+def test_a_terminal_of_ascii_is_told_what_it_can_show(copied_bundle, rewrite, bundle):
+    rewrite(msgspec.structs.replace(bundle.calibration, name="K\u00fcche"))
+    env = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    result = cvo_edge("inspect", copied_bundle, env=env)
+    assert result.returncode == 0
+    assert "K\\xfcche" in result.stdout
+
+
+def test_verify_needs_none_of_the_first_three_files(bundle_dir):
+    words = [*CVO_EDGE, "verify", str(bundle_dir)]
+    done = subprocess.run(["sh", "-c", 'exec "$@" <&- 2>&-', "sh", *words], check=False)
+    assert done.returncode == 0
+
+
+def test_what_libraries_print_is_not_among_ours(bundle_dir, clip_dir, tmp_path):
+    image = min(clip_dir.glob("*.jpg")).read_bytes()
+    place = len(image) // 2
+    # libjpeg says so at length, and decodes on.
+    (tmp_path / "0.jpg").write_bytes(image[:place] + image[-2:])
+    (tmp_path / "1.jpg").write_bytes(image)
+    result = cvo_edge("run", bundle_dir, tmp_path, "--quiet")
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_where_no_python_runs(bundle_dir, tmp_path, number):
+    """A picture that takes minutes to decode, by a library that knows no signals."""
+    jpeg = cv2.imencode(
+        ".jpg", np.zeros((8000, 8000, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    )[1].tobytes()
+    scan = jpeg[jpeg.rindex(b"\xff\xda") : -2]
+    slow = jpeg[:-2] + (60 - jpeg.count(b"\xff\xda")) * scan + jpeg[-2:]
+    for name in range(40):
+        (tmp_path / f"{name}.jpg").write_bytes(slow)
+    with subprocess.Popen(
+        [*FOREGROUND, "run", str(bundle_dir), str(tmp_path)], stdout=subprocess.DEVNULL
+    ) as process:
+        time.sleep(4.0)
+        assert process.poll() is None
+        begin = time.monotonic()
+        process.send_signal(number)
+        assert process.wait(30) == 128 + number
+        assert time.monotonic() - begin < 1.0

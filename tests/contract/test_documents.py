@@ -1,6 +1,7 @@
 """Figures in the documents are those that the programs of ``bench`` wrote."""
 
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -48,3 +49,4 @@ def test_every_reason_and_every_exit_code_is_explained() -> None:
     assert {row for row in rows if "_" in row} == {reason.value for reason in Reason}
     codes = {str(error.exit_code) for error in errors.CvoError.__subclasses__()}
     assert {row for row in rows if row.isdigit()} == codes | {"0", "1"}
+    assert f"{128 + signal.SIGINT}, {128 + signal.SIGTERM}" in rows

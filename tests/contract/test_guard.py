@@ -1,7 +1,9 @@
 """Models that a digest cannot tell from good ones: ``verify`` ends, and says what they did."""
 
 import hashlib
+import math
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -12,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from cvo_edge import GateError, ModelError
+from cvo_edge import BundleMismatchError, GateError, ModelError
 from cvo_edge.artifact import MODEL_FILE
 from cvo_edge.guard import verify_bundle
 
@@ -70,9 +72,9 @@ def endless(bundle):
 
 
 def enormous(bundle):
-    """64 GiB of zeros, a few hundred bytes."""
+    """3 GiB of zeros, which the machine would give, in a few hundred bytes."""
     helper, proto = onnx.helper, onnx.TensorProto
-    constants = [onnx.numpy_helper.from_array(np.array([2**34]), "elements")]
+    constants = [onnx.numpy_helper.from_array(np.array([3 * 2**28]), "elements")]
     pieces = [
         helper.make_node("Cast", ["least"], ["one"], to=proto.INT64),
         helper.make_node("Sub", ["one", "one"], ["none"]),
@@ -150,3 +152,39 @@ def test_a_terminated_verify_leaves_no_process_behind(with_model, bundle):
     assert process.wait(30) == 143
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
+
+
+def test_many_threads_have_room_for_their_stacks(bundle_dir):
+    stack = 64 << 20
+    command = [sys.executable, "-P", "-c", RUN, "verify", bundle_dir, "--threads", "32"]
+    done = subprocess.run(
+        [*map(str, command)],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_STACK, (stack, stack)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_is_said_has_a_bound(rewrite, bundle):
+    """An answer longer than a pipe would have its process wait for a reader."""
+    model = bundle.calibration.model
+    more = tuple(
+        msgspec.structs.replace(model.outputs[0], name="\U0001f600" * 190 + str(number))
+        for number in range(30)
+    )
+    outputs = {
+        **bundle.calibration.selftest.outputs,
+        **{spec.name: [0.0] * math.prod(spec.shape) for spec in more},
+    }
+    folder = rewrite(
+        msgspec.structs.replace(
+            bundle.calibration,
+            model=msgspec.structs.replace(model, outputs=(*model.outputs, *more)),
+            selftest=msgspec.structs.replace(bundle.calibration.selftest, outputs=outputs),
+        )
+    )
+    with pytest.raises(BundleMismatchError, match="expected") as caught:
+        verify_bundle(folder, threads=1)
+    assert len(str(caught.value)) <= 1000

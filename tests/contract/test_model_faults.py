@@ -6,10 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from cvo_edge import Bundle, Odometer, Reason, Status, artifact
+from cvo_edge import Bundle, ModelError, Odometer, Reason, Status, artifact
 from cvo_edge.artifact import CONFIDENCES, Threshold, decode_calibration, encode_calibration
 from cvo_edge.geometry import euler_zyx_to_quaternion
 from cvo_edge.preprocess import selftest_image
+from cvo_edge.session import Session
 
 onnx = pytest.importorskip("onnx")
 
@@ -168,3 +169,39 @@ def test_too_few_scores_are_unbounded_and_stay_so_to_the_record(bundle):
 def test_a_quaternion_of_any_length_and_sign_is_the_same_rotation(bundle):
     found = step(bundle, pose=[0, 0, 0, 0, 0, 0, -3.0])
     np.testing.assert_allclose(found.pose.q_xyzw, [0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("found", [1, 3, 6])
+def test_an_output_of_another_shape_than_declared_fails(bundle, found):
+    """Only where it runs can be seen what a model gives: its end of a slice is a number."""
+    model = onnx.load_from_string(constant_model(IDENTITY, (-1.0,) * 6, (1.0,) * 6))
+    graph, helper = model.graph, onnx.helper
+    (add,) = [node for node in graph.node if list(node.output) == ["lower"]]
+    add.output[0] = "whole"
+    names = {"begin": [0], "axis": [1], "wanted": [found]}
+    graph.initializer.extend(
+        onnx.numpy_helper.from_array(np.array(values, np.int64), name)
+        for name, values in names.items()
+    )
+    graph.node.extend(
+        [
+            helper.make_node("Cast", ["nothing"], ["whole_nothing"], to=onnx.TensorProto.INT64),
+            helper.make_node("Add", ["wanted", "whole_nothing"], ["end"]),
+            helper.make_node("Slice", ["whole", "begin", "end", "axis"], ["lower"]),
+        ]
+    )
+    spec = msgspec.structs.replace(bundle.calibration.model, precision="fp32")
+    session = Session(model.SerializeToString(), 1, spec)
+    feeds = {"image": np.zeros((1, 192, 256, 3), np.uint8)}
+    if found == 6:
+        assert session.run(feeds)["lower"].shape == (1, 6)
+    else:
+        with pytest.raises(ModelError, match=r"expected lower \[1, 6\], as declared, found"):
+            session.run(feeds)
+
+
+def test_nothing_is_printed_of_a_model_that_is_refused(bundle, capfd):
+    content = bundle.model_bytes.replace(b"Conv", b"Q\xff\xfeQ")
+    with pytest.raises(ModelError, match="refused by onnxruntime"):
+        Session(content, 1)
+    assert capfd.readouterr() == ("", "")

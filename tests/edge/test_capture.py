@@ -13,9 +13,14 @@ from pathlib import Path
 import pytest
 
 from cvo_edge import SourceError, UsageError, open_source, read_records
+from cvo_edge.capture import Arrivals
 from cvo_edge.sources import PAUSES_S, Camera
 
-RUN = "from cvo_edge.cli import main; main()"
+# Whoever runs the suite in the background of a script has it ignore SIGINT, and its children too.
+RUN = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from cvo_edge.cli import main; main()"
+)
 BOUNDARY = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n"
 
 
@@ -26,7 +31,7 @@ class NetworkCamera:
     """
 
     def __init__(self, pictures, lives):
-        camera, self.connections = self, 0
+        camera, self.connections, self.sent_ns = self, 0, []
 
         class Handler(http.server.BaseHTTPRequestHandler):
             def log_message(self, *_):
@@ -44,6 +49,7 @@ class NetworkCamera:
                 try:
                     for k in range(frames):
                         picture = pictures[k % len(pictures)]
+                        camera.sent_ns.append(time.time_ns())
                         self.wfile.write(BOUNDARY % (len(picture), picture))
                         time.sleep(0.02)
                     camera.stopped.wait(silence_s)
@@ -74,6 +80,12 @@ def network_camera(clip_dir):
     yield start
     for camera in cameras:
         camera.close()
+
+
+@pytest.fixture
+def hasty(monkeypatch):
+    """Attempts without pauses between them."""
+    monkeypatch.setattr("cvo_edge.sources.PAUSES_S", (0.01,) * len(PAUSES_S))
 
 
 def test_a_stream_that_hangs_or_ends_is_opened_again_and_goes_on(network_camera, caplog):
@@ -147,7 +159,7 @@ def test_a_camera_that_never_answers_is_given_up(bundle_dir, tmp_path):
     assert last.startswith(f"cvo-edge: {pipe}: expected an answer within 0.2 s, found none, and")
 
 
-def test_nobody_there_is_refused_in_the_same_way():
+def test_nobody_there_is_refused_in_the_same_way(hasty):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{free.getsockname()[1]}/camera.mjpg"
@@ -179,6 +191,39 @@ def test_a_signal_is_answered_within_a_second_while_a_read_blocks(
     assert len(list(read_records(records))) >= seen > 0
 
 
+@pytest.mark.parametrize("mode", ["live", "latency"])
+def test_what_lay_in_a_queue_while_the_process_was_stopped_has_no_interval(
+    network_camera, bundle_dir, tmp_path, mode
+):
+    camera = network_camera((1000, 0.0))
+    records = tmp_path / "records.jsonl"
+    arguments = ["run", bundle_dir, camera.address, "-o", records, "--mode", mode, "--threads", 1]
+    process = subprocess.Popen([sys.executable, "-c", RUN, *map(str, arguments)])
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline and not (records.exists() and records.stat().st_size):
+        time.sleep(0.02)
+    time.sleep(1.0)
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(3.0)
+    process.send_signal(signal.SIGCONT)
+    time.sleep(3.0)
+    process.terminate()
+    process.wait(timeout=30)
+    assert camera.connections == 1
+    # One frame of the camera is one number, whether it was looked at or left out.
+    ages = [
+        (1e-9 * (record.stamp_ns - camera.sent_ns[record.seq]), record)
+        for record in read_records(records)
+    ]
+    old = [record for age_s, record in ages if age_s > 1.0]
+    assert old
+    assert {record.status for record in old} == {"degraded"}
+    assert all("frame_stale" in record.reasons for record in old)
+    # And they end.
+    assert ages[-1][1].status == "ok"
+    assert ages[-1][0] < 1.0
+
+
 @pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_time_to_wait_must_be_one(timeout_s, tmp_path):
     with pytest.raises(UsageError, match="timeout"):
@@ -188,3 +233,78 @@ def test_a_time_to_wait_must_be_one(timeout_s, tmp_path):
 def test_camera_is_what_a_pipe_and_an_address_are(network_camera):
     camera = network_camera((1000, 0.0))
     assert isinstance(open_source(camera.address), Camera)
+
+
+def test_a_password_is_in_no_record_and_no_message(network_camera, caplog, hasty):
+    camera = network_camera((5, 0.0))
+    address = camera.address.replace("//", "//user:secret@")
+    seen = []
+    with pytest.raises(SourceError) as caught:
+        seen.extend(open_source(address, timeout_s=0.3))
+    assert seen
+    assert all(frame.source.startswith(camera.address) for frame in seen)
+    said = [str(caught.value), *(record.getMessage() for record in caplog.records)]
+    assert not any("secret" in text for text in said)
+
+
+def test_an_address_of_single_pictures_is_no_camera(network_camera, hasty):
+    camera = network_camera(*[(1, 0.0)] * 100)
+    with pytest.raises(SourceError, match=f"and again {len(PAUSES_S)} times"):
+        list(open_source(camera.address, timeout_s=0.5))
+    assert camera.connections <= 1 + len(PAUSES_S)
+
+
+def test_stop_ends_the_wait_for_a_camera_that_does_not_open(tmp_path):
+    script = """
+import os, sys, threading, time
+from cvo_edge.sources import Camera
+import cvo_edge.sources as sources
+
+camera = Camera.__new__(Camera)
+threading.Timer(1.0, lambda: camera.stop()).start()
+begin = time.monotonic()
+camera.__init__(sys.argv[1], None, 10.0)
+print(time.monotonic() - begin < 3.0, flush=True)
+os._exit(0)
+"""
+    os.mkfifo(tmp_path / "camera")
+    done = subprocess.run(
+        [sys.executable, "-c", script, tmp_path / "camera"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.stdout == "True\n", done.stderr
+
+
+def test_bench_connects_once(network_camera, bundle_dir):
+    camera = network_camera((10_000, 0.0))
+    arguments = ["bench", bundle_dir, camera.address, "--frames", 5, "--warmup", 1]
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, *map(str, arguments), "--mode", "live"],
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, camera.connections) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("gaps", "waits", "queued"),
+    [
+        # thirty a second, one pause of which 3 lie ready, and then it goes on
+        ([0.03] * 5 + [3.0] + [0.001] * 3 + [0.03] * 3, 0.03, [0] * 5 + [1] * 4 + [0] * 3),
+        # one every two seconds: twice it looks like a pause
+        ([0.2, 2.0, 2.0, 2.0, 2.0], 2.0, [0, 1, 1, 0, 0]),
+        # it took long to open, and its first frame is new
+        ([4.0, 0.03, 0.03], 0.03, [1, 0, 0]),
+    ],
+)
+def test_what_comes_at_once_after_a_pause_is_old(gaps, waits, queued):
+    arrivals, now, found = Arrivals(0.0), 0.0, []
+    for gap in gaps:
+        now += gap
+        found.append(arrivals.queued_s(now - min(gap, waits), now))
+    assert [age > 0 for age in found] == [bool(value) for value in queued]
+    assert all(age in (0.0, max(gaps)) for age in found)

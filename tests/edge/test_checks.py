@@ -1,5 +1,7 @@
 """Frames that look wrong, and frames that look wrong where they stand, claim no interval."""
 
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -91,7 +93,7 @@ def test_a_still_scene_with_noise_of_one_grey_level_stays_ok(bundle_dir, images)
             assert estimate.status is Status.OK
 
 
-@pytest.mark.parametrize("mode", ["latency", "throughput"])
+@pytest.mark.parametrize("mode", ["latency", "throughput", "live"])
 def test_every_mode_sees_the_stream_in_its_order(bundle_dir, images, mode):
     other = np.ascontiguousarray(images[4][:200])
     frames = [
@@ -106,8 +108,19 @@ def test_every_mode_sees_the_stream_in_its_order(bundle_dir, images, mode):
         Frame(images[6], 500, "", 0.0, waited_ms=1500.0),
         Frame(images[7], 600, "", 0.0),
     ]
+    # In live each waits until the one before was seen, or it would be left out.
+    wanted = threading.Semaphore(1 if mode == "live" else len(frames))
+
+    def coming():
+        for frame in frames:
+            wanted.acquire()
+            yield frame
+
     with Odometer.load(bundle_dir, threads=2, mode=mode) as odometer:
-        found = [(e.status, e.reasons, e.bounded) for e in odometer.stream(frames)]
+        found = []
+        for estimate in odometer.stream(coming()):
+            found.append((estimate.status, estimate.reasons, estimate.bounded))
+            wanted.release()
     ok = (Status.OK, (), True)
     assert found == [
         ok,

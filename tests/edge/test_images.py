@@ -222,3 +222,77 @@ def test_another_release_of_opencv_reads_the_same(tmp_path, clip_dir):
     ours = [decode_image(content) for content in contents]
     expected = ["None" if i is None else hashlib.sha256(i).hexdigest() for i in ours]
     assert [(n, a) for n, a in enumerate(theirs)] == [(n, b) for n, b in enumerate(expected)]
+
+
+def framed(jpeg, height, width):
+    """The JPEG with another size in its frame header."""
+    place = jpeg.index(b"\xff\xc0") + 5
+    return jpeg[:place] + struct.pack(">HH", height, width) + jpeg[place + 4 :]
+
+
+def tagged(*tags, picture=bytes(256)):
+    """A TIFF of 16x16 grey pixels whose first tags are these: (tag, type, count, value)."""
+    rest = [
+        *((258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 8), (277, 3, 1, 1)),
+        *((278, 4, 1, 16), (279, 4, 1, len(picture))),
+    ]
+    entries = b"".join(struct.pack("<HHII", *tag) for tag in (*tags, *rest))
+    count = struct.pack("<H", len(tags) + len(rest))
+    return b"II*\0" + struct.pack("<I", 8 + len(picture)) + picture + count + entries + bytes(4)
+
+
+def hidden_jpeg():
+    """A marker without a length in front: who takes two bytes for one skips the true header."""
+    jpeg = encoded(".jpg", picture(16, 16))
+    large = b"\xff\xd8\xff\x01" + framed(jpeg, 20000, 40000)[2:-2]
+    # 0xffe0, what stands where the length would be, further on there is a small picture.
+    return large + bytes(4 + 0xFFE0 - len(large)) + jpeg[2:]
+
+
+def extended_webp(height, width):
+    """An extended file whose canvas is not its picture's size."""
+    webp = encoded(".webp", picture(16, 16))
+    sizes = (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
+    body = b"WEBPVP8X" + struct.pack("<I", 10) + bytes(4) + sizes + webp[12:]
+    return b"RIFF" + struct.pack("<I", len(body)) + body
+
+
+SIZE_TAGS = ((256, 4, 1, 16), (257, 4, 1, 16))
+TWO_SIZES = {
+    "a JPEG with a bare marker": hidden_jpeg(),
+    "a JPEG with two frame headers": (
+        lambda jpeg: framed(jpeg, 20000, 30000)[: jpeg.index(b"\xff\xda")] + jpeg[2:]
+    )(encoded(".jpg", picture(16, 16))),
+    "a TIFF with its width twice": tagged((256, 4, 1, 30000), (257, 4, 1, 20000), *SIZE_TAGS),
+    "a TIFF of large tiles": tagged(*SIZE_TAGS, (322, 3, 1, 9008), (323, 3, 1, 9008)),
+    "a BMP of OS/2": b"BM"
+    + struct.pack("<IHHI", 0, 0, 0, 32)
+    + struct.pack("<IHHHH", 12, 65535, 16000, 1, 1)
+    + bytes(4096),
+    "a PNM with a carriage return": b"P5 #\r40000 20000 #\n 16 16\n255\n" + bytes(256),
+    "a WebP with another canvas": extended_webp(20000, 16000),
+}
+
+
+@pytest.mark.parametrize("name", TWO_SIZES)
+def test_what_says_two_sizes_is_not_decoded(name, monkeypatch):
+    asked = []
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: asked.append(name))
+    assert decode_image(TWO_SIZES[name]) is None
+    assert asked == []
+
+
+def test_the_same_headers_with_one_size_are_read():
+    content = tagged(*SIZE_TAGS, picture=bytes(range(256)))
+    assert decode_image(content)[:, :, 1].ravel().tolist() == list(range(256))
+    assert decode_image(b"P5 # a\n16 # b\n 16\n255\n" + bytes(256)).shape == (16, 16, 3)
+    assert image_size(extended_webp(16, 16)) == (16, 16)
+
+
+def test_a_picture_of_many_passes_is_refused_and_one_of_ten_is_not():
+    jpeg = cv2.imencode(".jpg", picture(), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    scans = jpeg.count(b"\xff\xda")
+    assert scans > 1
+    assert decode_image(jpeg) is not None
+    scan = jpeg[jpeg.rindex(b"\xff\xda") : -2]
+    assert decode_image(jpeg[:-2] + 100 * scan + jpeg[-2:]) is None

@@ -366,3 +366,23 @@ def test_a_files_digests_are_those_of_its_parts(tmp_path):
 def test_a_bundle_without_a_cache_is_read_as_before(bundle_dir):
     with Odometer.load(bundle_dir) as odometer:
         assert odometer.calibration == read_bundle(bundle_dir).calibration
+
+
+@pytest.mark.parametrize("content", [b'{"name":"\xff"}', b"[" * 100_000, b"", b"{}", b"null"])
+def test_an_entry_that_is_no_text_costs_its_advantage_only(content, bundle_dir, bundle, cache):
+    load_bundle(bundle_dir, cache)
+    path = entry_folder(cache) / ENTRY_FILE
+    path.write_bytes(content)
+    assert cache.entries() == []
+    assert cache.find(bundle.calibration.model.sha256) is None
+    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+    (entry_folder(cache) / SEEN_FILE).write_bytes(content)
+    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+
+
+def test_a_model_that_has_grown_beyond_its_limit_is_refused_at_once(copied_bundle, cache):
+    load_bundle(copied_bundle, cache)
+    with (copied_bundle / "model.onnx").open("r+b") as stream:
+        stream.truncate(300 << 30)
+    with pytest.raises(ModelError, match="at most 1073741824 bytes"):
+        load_bundle(copied_bundle, cache)

@@ -18,7 +18,7 @@ def estimates(bundle_dir, clip_dir):
     frames = list(open_source(str(clip_dir), fps=30))[:3]
     with Odometer.load(bundle_dir) as odometer:
         good = list(odometer.stream(frames))
-        return [*good, odometer.step(None, stamp_ns=99, source="lost.png")]
+        return [*good, odometer.step(None, stamp_ns=99_000_000, source="lost.png")]
 
 
 def write(path, format, estimates):
@@ -102,3 +102,21 @@ def test_a_file_that_cannot_be_opened_is_a_sink_error(tmp_path):
 def test_a_full_disk_is_a_sink_error(estimates):
     with Sink("/dev/full", "jsonl") as sink, pytest.raises(SinkError, match="No space left"):
         sink.write(estimates[0])
+
+
+def test_a_table_is_one_line_a_frame_whatever_a_file_is_called(tmp_path, estimates):
+    named = dataclasses.replace(estimates[0], source="x\x1b[2J\nframe-9  ok.jpg")
+    lines = write(tmp_path / "a.txt", "table", [named]).splitlines()
+    assert len(lines) == 2
+    assert lines[1].isprintable()
+
+
+def test_one_file_has_one_writer(tmp_path, estimates):
+    path = tmp_path / "a.jsonl"
+    with Sink(str(path), "jsonl") as sink:
+        sink.write(estimates[0])
+        with pytest.raises(SinkError, match="no other run writes to"):
+            Sink(str(path), "jsonl")
+        sink.write(estimates[1])
+    assert len(path.read_text().splitlines()) == 2
+    assert len(write(path, "jsonl", estimates).splitlines()) == len(estimates)

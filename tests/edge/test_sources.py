@@ -1,12 +1,16 @@
 """Sources: order, damage, ends, stamps."""
 
+import gc
 import os
+import threading
+import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from cvo_edge.capture import READER
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.images import decode_image
 from cvo_edge.sources import Video, open_source
@@ -152,3 +156,44 @@ def test_a_camera_that_is_not_there_is_refused():
         pytest.skip("this machine has 64 cameras")
     with pytest.raises(SourceError, match="63"):
         open_source("63")
+
+
+def test_a_file_of_any_kind_and_size_costs_its_own_frame(tmp_path):
+    write(tmp_path / "0.png")
+    with (tmp_path / "1.png").open("wb") as stream:
+        stream.truncate(2 << 40)
+    source = open_source(str(tmp_path))
+    write(tmp_path / "2.png")
+    frames = list(open_source(str(tmp_path)))
+    assert [frame.image is None for frame in frames] == [False, True, False]
+    # What was a file when it was listed may be a pipe when it is read.
+    (tmp_path / "1.png").unlink()
+    os.mkfifo(tmp_path / "1.png")
+    assert [frame.image is None for frame in source] == [False, True]
+
+
+def test_a_video_s_name_is_utf8_or_refused(tmp_path, video):
+    path = os.fsencode(tmp_path) + b"/\xff.avi"
+    os.rename(video, path)  # noqa: PTH104
+    with pytest.raises(SourceError, match="expected a name in UTF-8"):
+        open_source(os.fsdecode(path))
+
+
+def test_a_source_that_nobody_reads_gives_its_file_back(video):
+    def threads():
+        return [thread for thread in threading.enumerate() if thread.name == READER]
+
+    before = len(threads())
+    for _ in range(5):
+        open_source(str(video))
+    gc.collect()
+    deadline = time.monotonic() + 10.0
+    while len(threads()) > before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert len(threads()) == before
+
+
+@pytest.mark.parametrize("text", ["x" * 300, "a/" * 3000])
+def test_a_name_too_long_is_no_source(text):
+    with pytest.raises(SourceError):
+        open_source(text)

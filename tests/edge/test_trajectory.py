@@ -89,6 +89,9 @@ def test_tum_is_matched_by_the_nearest_stamp_within_twenty_milliseconds(tmp_path
         ("0 0 0 0 0 0 0 0\n", "eight numbers"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "growing stamps"),
         ("nan 0 0 0 0 0 0 1\n", "eight numbers"),
+        ("1" * 5001 + " 0 0 0 0 0 0 1\n", "eight numbers"),
+        ("-1e300 0 0 0 0 0 0 1\n", "eight numbers"),
+        ("0 0 0 0 1e308 1e308 0 1e308\n", "eight numbers"),
     ],
 )
 def test_a_broken_trajectory_names_the_rule(tmp_path, text, rule):
@@ -102,6 +105,18 @@ def test_no_ground_truth_is_refused(tmp_path):
     with pytest.raises(SourceError, match="found no valid one"):
         open_ground_truth(tmp_path)
     os.mkfifo(tmp_path / "fifo")
-    for name in ("none.txt", "fifo"):
-        with pytest.raises(SourceError, match="expected a TUM trajectory"):
-            open_ground_truth(tmp_path / name)
+    with pytest.raises(SourceError, match="expected a TUM trajectory"):
+        open_ground_truth(tmp_path / "none.txt")
+    with pytest.raises(SourceError, match="expected a regular file"):
+        open_ground_truth(tmp_path / "fifo")
+
+
+def test_a_pose_file_of_another_kind_or_size_is_no_pose(tmp_path):
+    os.mkfifo(tmp_path / "a.pose.txt")
+    with (tmp_path / "b.pose.txt").open("wb") as stream:
+        stream.truncate(2 << 40)
+    np.savetxt(tmp_path / "c.pose.txt", np.eye(4))
+    truth = open_ground_truth(tmp_path)
+    assert truth.pose_of(frame(source="a.color.jpg")) is None
+    assert truth.pose_of(frame(source="b.color.jpg")) is None
+    assert truth.pose_of(frame(source="c.color.jpg")) is not None

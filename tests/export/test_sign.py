@@ -171,6 +171,10 @@ def test_a_record_of_versions_that_cannot_be_read_or_written_stops_it(copied_bun
     state.write_text("{")
     with pytest.raises(BundleMismatchError, match=r"versions\.json: expected the versions"):
         load(copied_bundle, public)
+    for content in (b'{"\xff": {"a": 1}}', b"[" * 100_000, b'{"a": 1}', b""):
+        state.write_bytes(content)
+        with pytest.raises(BundleMismatchError, match=r"versions\.json: expected the versions"):
+            load(copied_bundle, public)
     state.unlink()
     state.mkdir()
     with pytest.raises((BundleMismatchError, SinkError), match=r"versions\.json"):
@@ -182,13 +186,14 @@ def test_processes_at_once_keep_the_highest(tmp_path):
     code = (
         "import sys; from pathlib import Path; from cvo_edge.signature import Versions\n"
         "versions = Versions(Path(sys.argv[1]))\n"
-        "for v in range(int(sys.argv[2]), 200, 4): versions.raise_to('k', 'n', v)"
+        "for v in range(1, 100):\n"
+        "    versions.raise_to('k', sys.argv[2], v); versions.raise_to('k', 'of all', v)"
     )
-    processes = [
-        subprocess.Popen([sys.executable, "-c", code, path, str(first)]) for first in range(1, 5)
-    ]
+    names = ["a", "b", "c", "d"]
+    processes = [subprocess.Popen([sys.executable, "-c", code, path, name]) for name in names]
     assert [process.wait() for process in processes] == [0] * 4
-    assert Versions(path).highest("k", "n") == 199
+    # Whoever read before another wrote would have put its own in place of all.
+    assert [Versions(path).highest("k", name) for name in (*names, "of all")] == [99] * 5
     assert [p.name for p in path.parent.iterdir() if p.suffix not in (".json", ".lock")] == []
 
 
@@ -220,7 +225,6 @@ def test_a_private_key_may_be_encrypted(copied_bundle, tmp_path, monkeypatch):
 
 def test_both_command_lines(copied_bundle, clip_dir, keys, tmp_path):
     secret, public = keys
-    state = {**os.environ}
 
     def program(name, *arguments):
         module = {"cvo-edge": "cvo_edge", "cvo-export": "cvo_export"}[name]
@@ -229,7 +233,6 @@ def test_both_command_lines(copied_bundle, clip_dir, keys, tmp_path):
             [sys.executable, "-c", code, *map(str, arguments)],
             capture_output=True,
             text=True,
-            env=state,
             check=False,
         )
 
@@ -257,3 +260,42 @@ def test_openssl_makes_keys_that_fit(copied_bundle, tmp_path):
     subprocess.run(["openssl", "pkey", "-in", secret, "-pubout", "-out", public], check=True)
     sign(copied_bundle, Path(secret))
     load(copied_bundle, Path(public))
+
+
+def test_what_lies_where_a_signature_is_written_is_not_followed(copied_bundle, keys, tmp_path):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (copied_bundle / SIGNATURE_FILE).symlink_to(victim)
+    for name in (f"{SIGNATURE_FILE}.partial", f"{SIGNATURE_FILE}.{os.getpid()}.partial"):
+        (copied_bundle / name).symlink_to(victim)
+    with pytest.raises(SinkError):
+        sign(copied_bundle, keys[0])
+    (copied_bundle / name).unlink()
+    sign(copied_bundle, keys[0])
+    assert victim.read_text() == "precious"
+    assert not (copied_bundle / SIGNATURE_FILE).is_symlink()
+    load(copied_bundle, keys[1])
+
+
+def test_keys_may_lie_behind_links(copied_bundle, keys, tmp_path):
+    links = [tmp_path / f"link-{number}" for number in range(2)]
+    for link, key in zip(links, keys, strict=True):
+        link.symlink_to(key)
+    sign(copied_bundle, links[0])
+    load(copied_bundle, links[1])
+
+
+def test_a_device_remembers_in_one_place_or_says_that_it_cannot(copied_bundle, keys, monkeypatch):
+    sign(copied_bundle, keys[0])
+    monkeypatch.setenv("CVO_EDGE_STATE", "relative")
+    with pytest.raises(UsageError, match="CVO_EDGE_STATE: expected an absolute path"):
+        load(copied_bundle, keys[1])
+    monkeypatch.delenv("CVO_EDGE_STATE")
+    monkeypatch.delenv("XDG_STATE_HOME", raising=False)
+
+    def homeless(path):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "expanduser", homeless)
+    with pytest.raises((BundleMismatchError, SinkError), match=r"versions\.json"):
+        load(copied_bundle, keys[1])

@@ -23,6 +23,9 @@ SHORT = {
 # What some trial of a kind must have led to: or nothing was tried.
 SEEN = {
     "models": "exit code 5",
+    # That of a model which is none: so its digests did fit.
+    "models_that_fit": "exit code 4",
+    "kills": "whole",
     "artifacts": "exit code 3",
     "artifacts_that_fit": "exit code 3",
     "sensors": "frozen, degraded",
