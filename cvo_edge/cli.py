@@ -358,7 +358,8 @@ def _refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
     for given in inputs:
         if given is None:
             continue
-        files = [given, *glob.iglob(str(given)), *glob.iglob(os.path.join(given, "*"))]  # noqa: PTH118
+        name = str(given)
+        files = [name, *glob.iglob(name), *glob.iglob(f"{glob.escape(name)}/*")]
         if any(os.path.exists(file) and written.samefile(file) for file in files):  # noqa: PTH110
             raise UsageError(f"output: expected a file of its own, found {output} among the input")
 
