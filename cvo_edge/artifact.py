@@ -316,6 +316,10 @@ def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibra
         _check_digest(content)
         calibration = msgspec.convert(document, Calibration, strict=True)
         _check_rules(calibration)
+        # JSON can say half of a surrogate pair, which nobody can print.
+        json.dumps(document, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise CalibrationFileError(f"{where}: expected characters, found half of one") from None
     except CalibrationFileError as error:
         raise CalibrationFileError(f"{where}: {error}") from None
     except msgspec.ValidationError as error:
@@ -346,11 +350,6 @@ def _parse_json(content: bytes) -> dict[str, Any]:
             f"expected JSON, found an error in line {error.lineno} column {error.colno}: "
             f"{error.msg}"
         ) from None
-    try:
-        # JSON can say half of a surrogate pair, which nobody can print.
-        json.dumps(document, ensure_ascii=False).encode()
-    except UnicodeEncodeError:
-        raise CalibrationFileError("expected characters, found half of one") from None
     if not isinstance(document, dict):
         raise CalibrationFileError(f"expected one JSON object, found {type(document).__name__}")
     return document
