@@ -280,7 +280,7 @@ json_values = st.recursive(
     | st.integers(-(2**70), 2**70)
     | st.floats(allow_nan=False, allow_infinity=False)
     | st.text(max_size=8)
-    | st.sampled_from(["marginal", "joint", "cjp", "csp", "1", "NaN"]),
+    | st.sampled_from(["marginal", "joint", "cjp", "csp", "1", "NaN", "\ud800"]),
     lambda inner: (
         st.lists(inner, max_size=7)
         | st.dictionaries(st.sampled_from(["q_hat", "n", "x"]), inner, max_size=3)
@@ -413,3 +413,11 @@ def test_bytes_that_are_no_model_are_refused_by_the_engine(copied_bundle, rewrit
     rewrite(msgspec.structs.replace(bundle.calibration, model=spec))
     with pytest.raises(ModelError, match="refused by onnxruntime"):
         Odometer.load(copied_bundle)
+
+
+@pytest.mark.parametrize("path", [("method",), ("pose", "rotation"), ("method_parameters", "x")])
+def test_half_a_character_is_refused_wherever_it_is(document, path):
+    with pytest.raises(CalibrationFileError):
+        decode_calibration(redigested(replaced(document, path, "\ud800")))
+    with pytest.raises(CalibrationFileError):
+        decode_calibration(redigested({**document, "\ud800": 1}))
