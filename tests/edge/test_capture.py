@@ -16,6 +16,8 @@ from cvo_edge import SourceError, UsageError, open_source, read_records
 from cvo_edge.capture import Arrivals
 from cvo_edge.sources import PAUSES_S, Camera
 
+pytestmark = pytest.mark.clock
+
 # Whoever runs the suite in the background of a script has it ignore SIGINT, and its children too.
 RUN = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
