@@ -47,11 +47,13 @@ class Grabbed:
 
     ``decode_ms`` is what it took from then on; ``read_ms`` with the wait for it, which is nothing
     but reading where frames are there already; ``queued_ms`` how long it may have lain in a queue
-    of a camera before.
+    of a camera before. ``position_ms`` is where a file's container puts it; a build of OpenCV may
+    count from the first frame's end.
     """
 
     image: NDArray[Any]
     stamp_ns: int
+    position_ms: float
     decode_ms: float
     read_ms: float
     queued_ms: float
@@ -96,7 +98,10 @@ class Capture:
         return self._ask(_Opened.properties, self._timeout_s)
 
     def read(self) -> Grabbed | None:
-        """Return the next image, or None at the end."""
+        """Return the next image, or None at the end, and for a file's frame that does not decode.
+
+        Whether it was the end is seen by asking again.
+        """
         return self._ask(_Opened.grab, self._timeout_s)
 
     def close(self) -> None:
@@ -155,7 +160,7 @@ class _Opened:
         )
 
     def grab(self) -> Grabbed | None:
-        """Take the next image, None at the end."""
+        """Take the next image, None where none comes."""
         try:
             begin = perf_counter()
             found = self._capture.grab()
@@ -167,9 +172,13 @@ class _Opened:
         if not found:
             return None
         end = perf_counter()
-        queued_ms = 1e3 * self._arrivals.queued_s(begin, come)
         return Grabbed(
-            np.asarray(image), stamp_ns, 1e3 * (end - come), 1e3 * (end - begin), queued_ms
+            image=np.asarray(image),
+            stamp_ns=stamp_ns,
+            position_ms=float(self._capture.get(cv2.CAP_PROP_POS_MSEC)),
+            decode_ms=1e3 * (end - come),
+            read_ms=1e3 * (end - begin),
+            queued_ms=1e3 * self._arrivals.queued_s(begin, come),
         )
 
     def release(self) -> None:

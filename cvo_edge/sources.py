@@ -162,16 +162,23 @@ class ImageFiles:
 
 
 class Video:
-    """A video file; stamps come from its frame rate unless ``fps`` is given."""
+    """A video file. Stamps are its container's, from the first frame on, unless ``fps`` is given.
+
+    Of a frame that does not decode, and has others behind it, there is no image.
+    """
 
     live = False
+
+    # So many in a row are an end, also where no number of frames is announced.
+    _UNREADABLE_IN_A_ROW = 100
 
     def __init__(self, path: Path, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
         self._path = path
         self._capture = Capture(str(path), timeout_s)
         self._capture.open()
         own, announced = self._capture.properties()
-        self._fps = fps or (own if 0.0 < own < 1e5 else None)
+        own_fps = own if 0.0 < own < 1e5 else None
+        self._stamps = _VideoStamps(fps or own_fps, counted=fps is not None)
         self.length: int | None = announced if announced > 0 else None
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
@@ -181,17 +188,60 @@ class Video:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames; raises SourceError where the file ends before its own count."""
-        seq = 0
+        seq = unreadable = 0
         with closing(self._capture):
-            while (grabbed := self._capture.read()) is not None:
-                name = f"{shown(self._path.name)}#{seq}"
-                yield Frame(grabbed.image, _stamp(seq, self._fps), name, grabbed.read_ms)
-                seq += 1
+            while unreadable < self._UNREADABLE_IN_A_ROW:
+                if (grabbed := self._capture.read()) is None:
+                    unreadable += 1
+                    continue
+                found = [*[(None, 0.0)] * unreadable, (grabbed.image, grabbed.read_ms)]
+                stamps = self._stamps.next(len(found), grabbed.position_ms)
+                for (image, read_ms), stamp_ns in zip(found, stamps, strict=True):
+                    yield Frame(image, stamp_ns, f"{shown(self._path.name)}#{seq}", read_ms)
+                    seq += 1
+                unreadable = 0
         if self.length is not None and seq < self.length:
             raise SourceError(
                 f"{self._path}: expected {self.length} frames, found it ended early: "
                 f"{seq} of {self.length}"
             )
+
+
+class _VideoStamps:
+    """Where a container puts its frames, in ns from the first one; counted where it does not say.
+
+    A frame that a decoder leaves out does not shift the ones behind it, and a phone's frames are
+    not one as long as the other.
+    """
+
+    # Nanoseconds in a record are of 64 bits.
+    _END_NS = 2.0**62
+
+    def __init__(self, fps: float | None, counted: bool) -> None:
+        self._fps, self._counted = fps, counted
+        self._seq = 0
+        self._origin_ms: float | None = None
+        self._last_ns = float("-inf")
+
+    def next(self, count: int, position_ms: float) -> list[int | None]:
+        """Stamps of the next ``count`` frames, the last of which is at ``position_ms``.
+
+        Those before it, unreadable ones, are put evenly between.
+        """
+        first = self._seq
+        self._seq += count
+        if self._fps is None:
+            return [None] * count
+        stamps = [1e9 * seq / self._fps for seq in range(first, self._seq)]
+        if self._origin_ms is None:
+            self._origin_ms = position_ms - 1e-6 * stamps[-1]
+            self._last_ns = stamps[0] - 1e9 / self._fps
+        own_ns = 1e6 * (position_ms - self._origin_ms)
+        if not self._counted and self._last_ns < own_ns < self._END_NS:
+            step_ns = (own_ns - self._last_ns) / count
+            stamps = [self._last_ns + step_ns * (index + 1) for index in range(count)]
+        self._last_ns = stamps[-1]
+        return [round(stamp_ns) for stamp_ns in stamps]
 
 
 class Camera:

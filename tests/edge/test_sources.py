@@ -2,6 +2,7 @@
 
 import gc
 import os
+import re
 import threading
 import time
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from cvo_edge.capture import READER
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.images import decode_image
-from cvo_edge.sources import Video, open_source
+from cvo_edge.sources import Video, _VideoStamps, open_source
 
 
 def picture(value=0, height=48, width=64):
@@ -136,12 +137,62 @@ def test_a_video_cut_short_is_told_after_its_frames(video):
     seen = []
     with pytest.raises(SourceError, match=r"ended early: \d+ of 20"):
         seen.extend(source)
-    if not seen:
-        for frame in open_source(str(video)):
-            seen.append(frame)
-            if len(seen) == 3:
-                break
     assert seen
+    assert all(frame.image is not None for frame in seen)
+
+
+@pytest.mark.parametrize("damaged", [[7], [0], [3, 4, 5], [0, 1, 9]])
+def test_a_damaged_frame_of_a_video_costs_itself_alone(video, damaged):
+    """No image in its place, and those behind it as they were, with the same names and stamps."""
+    whole = list(open_source(str(video)))
+    content = bytearray(video.read_bytes())
+    starts = [found.start() for found in re.finditer(rb"00dc.{4}\xff\xd8", content, re.DOTALL)]
+    assert len(starts) == 20
+    for seq in damaged:
+        begin, end = starts[seq] + 8, starts[seq + 1]
+        content[begin:end] = bytes(end - begin)
+    video.write_bytes(content)
+    frames = list(open_source(str(video)))
+    assert [frame.source for frame in frames] == [frame.source for frame in whole]
+    assert [frame.stamp_ns for frame in frames] == [frame.stamp_ns for frame in whole]
+    assert [seq for seq, frame in enumerate(frames) if frame.image is None] == damaged
+    for seq in set(range(20)) - set(damaged):
+        assert np.array_equal(frames[seq].image, whole[seq].image)
+
+
+def test_a_video_without_an_end_in_sight_ends(video):
+    """A container that announces more than it holds is asked a bounded number of times."""
+    content = bytearray(video.read_bytes())
+    # Frames of the whole file (avih), then of its stream (strh).
+    announced = (20).to_bytes(4, "little")
+    for place in (content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32):
+        assert content[place : place + 4] == announced
+        content[place : place + 4] = (10**9).to_bytes(4, "little")
+    video.write_bytes(content)
+    with pytest.raises(SourceError, match=r"ended early: 20 of 1000000000"):
+        list(open_source(str(video)))
+
+
+def test_stamps_are_where_the_container_puts_a_frame():
+    """Of unequal lengths, too; an OpenCV that counts from a frame's end gives the same."""
+    for shift_ms in (0.0, 40.0):
+        stamps = _VideoStamps(25.0, counted=False)
+        found = [stamps.next(1, shift_ms + place) for place in (0.0, 40.0, 90.0, 120.0)]
+        assert found == [[0], [40_000_000], [90_000_000], [120_000_000]]
+        # Two that could not be read are put between.
+        assert stamps.next(3, shift_ms + 240.0) == [160_000_000, 200_000_000, 240_000_000]
+
+
+@pytest.mark.parametrize("place", [0.0, -1.0, float("nan"), float("inf"), 1e300])
+def test_a_container_without_times_has_those_of_its_frame_rate(place):
+    stamps = _VideoStamps(25.0, counted=False)
+    assert [stamps.next(1, place) for _ in range(3)] == [[0], [40_000_000], [80_000_000]]
+    assert stamps.next(2, place) == [120_000_000, 160_000_000]
+
+
+def test_a_given_rate_is_taken_whatever_the_container_says():
+    stamps = _VideoStamps(10.0, counted=True)
+    assert [stamps.next(1, 40.0 * seq) for seq in range(3)] == [[0], [100_000_000], [200_000_000]]
 
 
 def test_a_text_file_is_no_video(tmp_path):
