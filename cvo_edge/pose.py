@@ -43,7 +43,7 @@ class Reason(StrEnum):
     IMAGE_SATURATED = "image_saturated"  # degraded: more than half of it is white
     IMAGE_FLAT = "image_flat"  # degraded: of one colour, without contrast
     IMAGE_SIZE_CHANGED = "image_size_changed"  # degraded: not the size of the stream's first frame
-    FRAME_REPEATED = "frame_repeated"  # degraded: the very image of the frame before, as if frozen
+    FRAME_REPEATED = "frame_repeated"  # degraded: an image that was there before, as if frozen
     FRAME_STALE = "frame_stale"  # degraded: it waited for more than a second
     STAMP_NOT_LATER = "stamp_not_later"  # degraded: not after the stamp of the frame before
     BOUNDS_CROSSED = "bounds_crossed"  # ok: a negative correction emptied a set; its middle stands

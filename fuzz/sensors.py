@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -63,15 +64,16 @@ def _with_nan(image: Image, generator: Generator) -> Image:
     return broken
 
 
-# Kind -> (image, the one before, generator) -> image or None.
-_IMAGES: dict[str, Callable[[Image, Image, Generator], Image | None]] = {
+# Kind -> (image, those before, generator) -> image or None.
+_IMAGES: dict[str, Callable[[Image, Sequence[Image], Generator], Image | None]] = {
     "black": lambda image, _, __: np.zeros_like(image),
     "black with noise": lambda image, _, g: _noisy(np.zeros_like(image), g, g.uniform(1.0, 6.0)),
     "white": lambda image, _, __: np.full_like(image, 255),
     "blown out": lambda image, _, g: np.clip(image * g.uniform(6.0, 20.0), 0, 255).astype(np.uint8),
     "one colour": lambda image, _, g: _one_colour(image, g),
-    "frozen": lambda _, before, __: before,
-    "frozen, another buffer": lambda _, before, __: before.copy(),
+    "frozen": lambda _, before, __: before[-1],
+    "frozen, another buffer": lambda _, before, __: before[-1].copy(),
+    "an old buffer": lambda _, before, g: before[int(g.integers(len(before)))],
     "cut JPEG": lambda image, _, g: _cut_jpeg(image, g),
     "another size": lambda image, _, g: _other_size(image, g),
     "NaN": lambda image, _, g: _with_nan(image, g),
@@ -135,7 +137,9 @@ def _estimates(
     kinds: list[str | None] = []
 
     def frames() -> Iterator[Frame]:
-        before, now_ns, left = images[0], 0, count
+        # As many as a driver may have.
+        before: deque[Image] = deque([images[0]], maxlen=8)
+        now_ns, left = 0, count
         while left > 0:
             number = len(kinds)
             image = _noisy(images[(number // 4) % len(images)], generator)
@@ -156,7 +160,7 @@ def _estimates(
             left -= kind is not None
             kinds.append(kind)
             if frame.image is not None and to_bgr8(frame.image) is not None:
-                before = frame.image
+                before.append(frame.image)
             yield frame
 
     for estimate in odometer.stream(frames()):

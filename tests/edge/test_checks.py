@@ -76,11 +76,33 @@ def test_a_lamp_or_a_dark_corner_is_no_fault(images, share):
 
 
 def test_a_frozen_camera_is_noticed_with_its_first_repetition(bundle_dir, images):
-    stream = [images[0], images[1], images[1], images[1].copy(), images[2], images[1]]
+    stream = [images[0], images[1], images[1], images[1].copy(), images[2], images[3]]
     with Odometer.load(bundle_dir, threads=1) as odometer:
         found = [estimate.reasons for estimate in odometer.stream(stream)]
     repeated = (Reason.FRAME_REPEATED,)
     assert found == [(), (), repeated, repeated, (), ()]
+
+
+@pytest.mark.parametrize("buffers", [2, 4, 8])
+def test_a_driver_that_hands_out_its_old_buffers_again_is_noticed(images, buffers):
+    checks = StreamChecks()
+    first, *again = (
+        [checks.doubts(look(image), None, 0.0) for image in images[:buffers]] for _ in range(3)
+    )
+    assert first == [()] * buffers
+    assert again == [[(Reason.FRAME_REPEATED,)] * buffers] * 2
+    # Alive again: its first new image is believed.
+    assert checks.doubts(look(images[buffers]), None, 0.0) == ()
+
+
+def test_a_still_scene_without_noise_where_something_moves_is_none_of_them(images):
+    """A rendered scene: the pixels looked at first are the same, and others are not."""
+    checks = StreamChecks()
+    for column in range(12):
+        image = images[0].copy()
+        image[0, column] ^= 255
+        tensor = image[np.newaxis, :192, :256]
+        assert checks.doubts(Look(tensor, (192, 256)), None, 0.0) == ()
 
 
 def test_a_still_scene_with_noise_of_one_grey_level_stays_ok(bundle_dir, images):

@@ -70,7 +70,7 @@ def test_a_bad_image_costs_that_frame_only(bundle_dir, frames, bad):
     first, second = frames[0].image, frames[1].image
     with Odometer.load(bundle_dir) as odometer:
         expected = [numbers(odometer.step(image)) for image in (first, second)]
-        odometer.step(frames[2].image)
+    with Odometer.load(bundle_dir) as odometer:
         before, broken, after = (odometer.step(image) for image in (first, bad, second))
     assert [numbers(before), numbers(after)] == expected
     assert broken.status is Status.INVALID

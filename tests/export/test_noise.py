@@ -289,13 +289,13 @@ def test_clean_thresholds_claim_no_band_under_noise(report):
 
 def test_the_report_says_which_noise_and_its_table_has_both_policies(report):
     assert report["noise"] == {"name": "speckle", "strength": 0.6, "seed": 0}
-    assert report["recalibrated"]["n_calibration"] + report["recalibrated"]["invalid"] == 64
+    assert report["recalibrated"]["n_calibration"] + report["recalibrated"]["left_out"] == 64
     json.dumps(report, allow_nan=False)
     lines = table(report)
     assert "noise speckle:0.6 (deviation, share of the pixel's own level), seed 0" in lines
     clean = lines.index("clean: the bundle's own thresholds, of 64 frames without noise")
     again = lines.index(
-        "recalibrated: thresholds of 64 calibration frames with the same noise; invalid 0"
+        "recalibrated: thresholds of 64 calibration frames with the same noise; left out 0"
     )
     for part, footnotes in ((lines[clean:again], 1), (lines[again:], 0)):
         assert sum("marginal" in line for line in part) == 5
@@ -332,7 +332,7 @@ def test_frames_that_a_check_flags_are_counted_in_both_roles(tiny_bundle, tiny_r
         tiny_bundle, replace(dataset, read_image=read), "test", noise=parse_noise("occlusion")
     )
     assert found["frames"]["invalid"] == 1
-    assert found["recalibrated"]["invalid"] == 1
+    assert found["recalibrated"]["left_out"] == 1
     assert found["recalibrated"]["n_calibration"] == 63
 
 
