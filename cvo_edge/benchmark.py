@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from cvo_edge import preprocess
+from cvo_edge.capture import shown
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.modes import AHEAD, Mode
 from cvo_edge.odometer import Odometer
@@ -101,7 +102,9 @@ def benchmark(
     measure = _steps if odometer.mode is Mode.LATENCY else _streams
     found = measure(odometer, session, stream, frames, warmup)
     if not found.latency.count:
-        raise SourceError(f"{source}: expected at least one valid frame, found none in {frames}")
+        raise SourceError(
+            f"{shown(source or 'image')}: expected at least one valid frame, found none in {frames}"
+        )
     counted = found.latency.count
     return {
         "bundle": odometer.calibration.name,
@@ -288,7 +291,7 @@ class _Endless:
             reads = open_source(self._source).reads()
             first = next(reads, None)
             if first is None:
-                raise SourceError(f"{self._source}: expected frames, found none")
+                raise SourceError(f"{shown(self._source)}: expected frames, found none")
             yield from chain([first], reads)
 
 

@@ -6,6 +6,7 @@ caller waits for an answer instead, for a bounded time; the thread that never an
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import time
@@ -14,7 +15,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from threading import Thread
+from statistics import fmean
+from threading import Event, Thread, current_thread
 from time import perf_counter
 from typing import Any, TypeVar
 
@@ -30,6 +32,8 @@ READER = "cvo-edge reader"
 TIMEOUT_S = 5.0
 # To open takes longer than the next frame: an address is looked up, a format is probed.
 _OPENING = 2.0
+# Giving a device back takes milliseconds.
+_RELEASE_S = 1.0
 
 T = TypeVar("T")
 
@@ -38,7 +42,7 @@ def shown(device: int | str) -> str:
     """Return a device's name for records and messages: in UTF-8, and without a password."""
     # A file name may be any bytes.
     text = os.fsencode(str(device)).decode("utf-8", "replace")
-    return re.sub("(?<=://)[^/@]*@", "", text)
+    return re.sub("(?<=://)[^/]*@", "", text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +74,24 @@ class Capture:
         self._device, self._timeout_s = device, timeout_s
         self._calls: SimpleQueue[Callable[[_Opened], object] | None] = SimpleQueue()
         self._answers: SimpleQueue[object] = SimpleQueue()
+        self._idle = Event()
         self._closed = False
         # The thread does not hold this object: whoever drops it ends the thread as well.
-        thread = Thread(target=_work, args=(self._calls, self._answers), name=READER, daemon=True)
+        thread = Thread(
+            target=_work, args=(self._calls, self._answers, self._idle), name=READER, daemon=True
+        )
         try:
             thread.start()
         except RuntimeError as error:
             raise SourceError(f"{shown(device)}: expected a thread to read it: {error}") from None
-        weakref.finalize(self, self._calls.put, None)
+        # Also where Python ends: it would end such a thread within OpenCV, and the process with it.
+        self._end = weakref.finalize(self, _end, thread, self._calls, self._idle)
 
-    def open(self) -> None:
-        """Open the device; raises SourceError where that cannot be done."""
+    def open(self) -> tuple[float, int]:
+        """Open the device -> frames a second and their number, 0 where it does not say.
+
+        Raises SourceError where that cannot be done.
+        """
         device = self._device
         try:
             # OpenCV ends the process at what is not.
@@ -89,13 +100,11 @@ class Capture:
             raise SourceError(
                 f"{shown(device)}: expected a name in UTF-8, found another: OpenCV opens none such"
             ) from None
-        if not self._ask(lambda opened: opened.open(device), _OPENING * self._timeout_s):
+        found = self._ask(lambda opened: opened.open(device), _OPENING * self._timeout_s)
+        if found is None:
             self.close()
             raise SourceError(f"{shown(device)}: expected a video or camera that opens, found none")
-
-    def properties(self) -> tuple[float, int]:
-        """Frames a second and number of frames, as the container says; 0 where it does not."""
-        return self._ask(_Opened.properties, self._timeout_s)
+        return found
 
     def read(self) -> Grabbed | None:
         """Return the next image, or None at the end, and for a file's frame that does not decode.
@@ -107,12 +116,13 @@ class Capture:
     def close(self) -> None:
         """Give it back, as soon as what it is at comes to an end; whoever waits need not."""
         self._closed = True
-        self._calls.put(None)
         self._answers.put(SourceError(f"{shown(self._device)}: closed"))
+        self._end()
 
     def _ask(self, call: Callable[[_Opened], T], timeout_s: float) -> T:
         if self._closed:
             raise SourceError(f"{shown(self._device)}: closed")
+        self._idle.clear()
         self._calls.put(call)
         try:
             answer = self._answers.get(timeout=timeout_s)
@@ -127,15 +137,28 @@ class Capture:
 
 
 def _work(
-    calls: SimpleQueue[Callable[[_Opened], object] | None], answers: SimpleQueue[object]
+    calls: SimpleQueue[Callable[[_Opened], object] | None],
+    answers: SimpleQueue[object],
+    idle: Event,
 ) -> None:
     opened = _Opened()
     while (call := calls.get()) is not None:
         try:
-            answers.put(call(opened))
+            answer = call(opened)
         except Exception as error:  # noqa: BLE001 - raised by whoever asked
-            answers.put(error)
+            answer = error
+        idle.set()
+        answers.put(answer)
     opened.release()
+
+
+def _end(
+    thread: Thread, calls: SimpleQueue[Callable[[_Opened], object] | None], idle: Event
+) -> None:
+    calls.put(None)
+    # Nobody waits for one that hangs; memory may be tidied up in the thread itself.
+    if idle.is_set() and thread is not current_thread():
+        thread.join(_RELEASE_S)
 
 
 class _Opened:
@@ -143,21 +166,19 @@ class _Opened:
 
     def __init__(self) -> None:
         self._capture = cv2.VideoCapture()
-        self._arrivals = Arrivals(perf_counter())
+        self._arrivals = Arrivals(perf_counter(), 0.0)
 
-    def open(self, device: int | str) -> bool:
-        """Open it -> whether that was done."""
+    def open(self, device: int | str) -> tuple[float, int] | None:
+        """Open it -> frames a second and their number, as the container says; None if it is not."""
+        begin = perf_counter()
         try:
-            return bool(self._capture.open(device))
+            if not self._capture.open(device):
+                return None
+            fps, count = map(self._capture.get, (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
         except cv2.error:
-            return False
-
-    def properties(self) -> tuple[float, int]:
-        """Frames a second, number of frames."""
-        return (
-            float(self._capture.get(cv2.CAP_PROP_FPS)),
-            int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)),
-        )
+            return None
+        self._arrivals = Arrivals(begin, fps)
+        return fps, int(count) if 0.0 < count < math.inf else 0
 
     def grab(self) -> Grabbed | None:
         """Take the next image, None where none comes."""
@@ -167,6 +188,7 @@ class _Opened:
             stamp_ns, come = time.time_ns(), perf_counter()
             if found:
                 found, image = self._capture.retrieve()
+            position_ms = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
         except cv2.error:
             return None
         if not found:
@@ -175,10 +197,10 @@ class _Opened:
         return Grabbed(
             image=np.asarray(image),
             stamp_ns=stamp_ns,
-            position_ms=float(self._capture.get(cv2.CAP_PROP_POS_MSEC)),
+            position_ms=position_ms,
             decode_ms=1e3 * (end - come),
             read_ms=1e3 * (end - begin),
-            queued_ms=1e3 * self._arrivals.queued_s(begin, come),
+            queued_ms=1e3 * self._arrivals.queued_s(come),
         )
 
     def release(self) -> None:
@@ -187,39 +209,60 @@ class _Opened:
 
 
 class Arrivals:
-    """Which frames of a camera were there before they were asked for, after a pause.
+    """Which frames of a camera may have waited in a queue, behind a pause.
 
-    Drivers and decoders keep frames that nobody takes. Whoever takes them all, one after the other,
-    finds none there; after a pause, of this process or of the camera, those that come at once are
-    old.
+    Drivers, networks and decoders keep frames that nobody takes. Whoever takes them all, one after
+    the other, is always ahead; after a pause, of this process or of the camera, those that were
+    kept come faster than a camera gives them, and are old until that ends.
     """
 
     # Shorter pauses leave nothing behind that matters; a slow camera's own are no pauses.
     _PAUSE_S, _USUAL_GAPS = 1.0, 3.0
-    # What is there already is there in less, and in less than half of the usual time.
-    _AT_ONCE_S = 0.005
+    # So many gaps tell the usual one, and so many, or so long a time, whether it is that again.
+    _USUAL, _SOME, _SOME_S = 64, 16, 2.0
+    # Gaps nearly as long as usual: the queue is empty, and each frame is waited for.
+    _AS_USUAL = 0.9
+    # So many pauses in a row are a camera's own rate.
+    _RATE = 3
+    _FPS, _LOWEST_FPS, _HIGHEST_FPS = 30.0, 0.01, 1000.0
 
-    def __init__(self, opened_at: float) -> None:
+    def __init__(self, opened_at: float, claimed_fps: float) -> None:
         self._last, self._first = opened_at, True
-        self._pause_s = 0.0
-        self._gaps: deque[float] = deque(maxlen=9)
+        believable = self._LOWEST_FPS <= claimed_fps <= self._HIGHEST_FPS
+        # Until some are known.
+        self._claimed_s = 1.0 / (claimed_fps if believable else self._FPS)
+        self._gaps: deque[float] = deque(maxlen=self._USUAL)
+        self._pause_s = self._behind_s = 0.0
+        self._pauses = 0
+        self._since: deque[float] = deque(maxlen=self._SOME)
 
-    def queued_s(self, asked: float, come: float) -> float:
-        """Seconds that a frame may have waited: the last pause, until a frame had to be waited for.
+    def queued_s(self, come: float) -> float:
+        """Seconds that the frame which came now may have waited: the last pause, or nothing.
 
-        ``asked`` and ``come`` in seconds of one clock.
+        ``come`` in seconds of the clock of ``opened_at``.
         """
         gap, self._last = come - self._last, come
-        usual = min(self._gaps, default=0.0)
+        first, self._first = self._first, False
+        usual = fmean(self._gaps) if self._gaps else self._claimed_s
         if gap > max(self._PAUSE_S, self._USUAL_GAPS * usual):
-            # Twice in a row it is the camera that takes so long.
-            if self._pause_s:
+            self._pauses += 1
+            if self._pauses >= self._RATE:
+                self._gaps.clear()
                 self._gaps.append(gap)
-            self._pause_s = gap
-        elif not self._pause_s or come - asked > max(self._AT_ONCE_S, 0.5 * usual):
-            self._pause_s = 0.0
+            self._pause_s = self._behind_s = gap
+            self._since.clear()
+            return gap
+        self._pauses = 0
+        if not self._pause_s:
             # The first one is behind the opening, not behind another frame.
-            if not self._first:
+            if not first:
                 self._gaps.append(gap)
-        self._first = False
+            return 0.0
+        self._since.append(gap)
+        waited_for = self._AS_USUAL * usual
+        # Each that came sooner made up for a part of the pause.
+        self._behind_s -= waited_for - gap
+        some = len(self._since) == self._SOME or sum(self._since) > self._SOME_S
+        if self._behind_s <= 0.0 or (some and fmean(self._since) >= waited_for):
+            self._pause_s = 0.0
         return self._pause_s

@@ -144,6 +144,7 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", help="No summary on stderr.")] = False,
 ) -> None:
     """Estimate a pose interval for every frame of a source."""
+    from cvo_edge.capture import shown
     from cvo_edge.odometer import Odometer
     from cvo_edge.run import RunSummary
     from cvo_edge.run import run as run_frames
@@ -184,7 +185,7 @@ def run(
                     _say("\n".join(summary.lines()))
     if summary.statuses["invalid"] == summary.frames:
         raise SourceError(
-            f"{source}: expected at least one valid frame, found none in {summary.frames}"
+            f"{shown(source)}: expected at least one valid frame, found none in {summary.frames}"
         )
 
 
@@ -359,7 +360,7 @@ def _refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
         if given is None:
             continue
         name = str(given)
-        files = [name, *glob.iglob(name), *glob.iglob(f"{glob.escape(name)}/*")]
+        files = [name, *glob.iglob(name, recursive=True), *glob.iglob(f"{glob.escape(name)}/*")]
         if any(os.path.exists(file) and written.samefile(file) for file in files):  # noqa: PTH110
             raise UsageError(f"output: expected a file of its own, found {output} among the input")
 

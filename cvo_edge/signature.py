@@ -204,7 +204,7 @@ class Versions:
                 os.fsync(stream.fileno())
                 Path(stream.name).replace(self.path)
             except BaseException:
-                Path(stream.name).unlink()
+                Path(stream.name).unlink(missing_ok=True)
                 raise
         folder = os.open(self.path.parent, os.O_RDONLY)
         try:

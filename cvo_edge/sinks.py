@@ -7,6 +7,7 @@ import fcntl
 import io
 import math
 import os
+import select
 import stat
 import sys
 from collections.abc import Callable, Iterable
@@ -107,13 +108,18 @@ class Sink:
         self._put(line)
 
     def _put(self, line: bytes) -> None:
-        try:
-            while line:
+        while line:
+            try:
                 line = line[os.write(self._descriptor, line) :]
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
+            except BrokenPipeError:
+                raise
+            except BlockingIOError:
+                # Another process has asked not to wait for this pipe's reader; records have to.
+                reader = select.poll()
+                reader.register(self._descriptor, select.POLLOUT)
+                reader.poll()
+            except OSError as error:
+                raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
 
 
 def _json_line(estimate: PoseInterval) -> bytes:
@@ -181,9 +187,10 @@ def _tum_line(estimate: PoseInterval) -> bytes:
             f"tum: expected a stamp for every frame, found none for {estimate.source or 'frame'}; "
             "give --fps"
         )
-    seconds, rest = divmod(estimate.stamp_ns, 1_000_000_000)
+    seconds, rest = divmod(abs(estimate.stamp_ns), 1_000_000_000)
+    sign = "-" if estimate.stamp_ns < 0 else ""
     numbers = " ".join(f"{value:.9f}" for value in estimate.pose.to_array().tolist())
-    return f"{seconds}.{rest:09d} {numbers}\n".encode()
+    return f"{sign}{seconds}.{rest:09d} {numbers}\n".encode()
 
 
 def _table_header(estimate: PoseInterval) -> bytes:

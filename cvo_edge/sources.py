@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import logging
+import math
 import re
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
@@ -103,7 +104,7 @@ def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_
     try:
         path.exists()
     except OSError as error:
-        raise SourceError(f"{text}: cannot be looked for: {error.strerror}") from None
+        raise SourceError(f"{shown(text)}: cannot be looked for: {error.strerror}") from None
     if path.is_dir():
         return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
     if names_camera(text):
@@ -114,9 +115,12 @@ def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_
         return Video(path, fps, timeout_s)
     if glob.has_magic(text):
         found = [Path(name) for name in glob.glob(text, recursive=True) if Path(name).is_file()]
-        return ImageFiles(_colour_images(found), fps, f"{text}: expected images, found no match")
+        return ImageFiles(
+            _colour_images(found), fps, f"{shown(text)}: expected images, found no match"
+        )
     raise SourceError(
-        f"{text}: expected a folder, glob, video file, camera index or device, found none of these"
+        f"{shown(text)}: expected a folder, glob, video file, camera index or device, found none "
+        "of these"
     )
 
 
@@ -175,10 +179,8 @@ class Video:
     def __init__(self, path: Path, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
         self._path = path
         self._capture = Capture(str(path), timeout_s)
-        self._capture.open()
-        own, announced = self._capture.properties()
-        own_fps = own if 0.0 < own < 1e5 else None
-        self._stamps = _VideoStamps(fps or own_fps, counted=fps is not None)
+        own_fps, announced = self._capture.open()
+        self._stamps = _VideoStamps(fps, own_fps)
         self.length: int | None = announced if announced > 0 else None
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
@@ -208,40 +210,44 @@ class Video:
 
 
 class _VideoStamps:
-    """Where a container puts its frames, in ns from the first one; counted where it does not say.
+    """Where a container puts its frames, in ns from the first one, unless a rate is given.
 
     A frame that a decoder leaves out does not shift the ones behind it, and a phone's frames are
-    not one as long as the other.
+    not one as long as the other. A container without times has those of its own rate.
     """
 
     # Nanoseconds in a record are of 64 bits.
     _END_NS = 2.0**62
 
-    def __init__(self, fps: float | None, counted: bool) -> None:
-        self._fps, self._counted = fps, counted
+    def __init__(self, fps: float | None, own_fps: float) -> None:
+        self._fps = fps
+        believable = LOWEST_FPS <= own_fps <= HIGHEST_FPS
+        # What is added where there is no later time; None where there is none at all.
+        self._step_ns = 1e9 / own_fps if believable else None
         self._seq = 0
-        self._origin_ms: float | None = None
-        self._last_ns = float("-inf")
+        self._origin_ms, self._last_ns = math.nan, 0.0
 
     def next(self, count: int, position_ms: float) -> list[int | None]:
         """Stamps of the next ``count`` frames, the last of which is at ``position_ms``.
 
         Those before it, unreadable ones, are put evenly between.
         """
-        first = self._seq
-        self._seq += count
-        if self._fps is None:
+        begin, self._seq = self._seq, self._seq + count
+        if self._fps is not None:
+            return [_stamp(seq, self._fps) for seq in range(begin, self._seq)]
+        if self._step_ns is None:
             return [None] * count
-        stamps = [1e9 * seq / self._fps for seq in range(first, self._seq)]
-        if self._origin_ms is None:
-            self._origin_ms = position_ms - 1e-6 * stamps[-1]
-            self._last_ns = stamps[0] - 1e9 / self._fps
-        own_ns = 1e6 * (position_ms - self._origin_ms)
-        if not self._counted and self._last_ns < own_ns < self._END_NS:
-            step_ns = (own_ns - self._last_ns) / count
-            stamps = [self._last_ns + step_ns * (index + 1) for index in range(count)]
-        self._last_ns = stamps[-1]
-        return [round(stamp_ns) for stamp_ns in stamps]
+        last_ns = -self._step_ns if begin == 0 else self._last_ns
+        if begin == 0:
+            self._origin_ms = position_ms - 1e-6 * self._step_ns * (count - 1)
+        now_ns = 1e6 * (position_ms - self._origin_ms)
+        if not last_ns < now_ns < self._END_NS:
+            now_ns = last_ns + self._step_ns * count
+        elif begin > 0:
+            # Half of it, so that its next time is a later one again.
+            self._step_ns = 0.5 * (now_ns - last_ns) / count
+        self._last_ns = now_ns
+        return [round(last_ns + (now_ns - last_ns) * (k + 1) / count) for k in range(count)]
 
 
 class Camera:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import tempfile
@@ -17,7 +18,7 @@ from fuzz.trials import Tally, beside_each_other
 
 BUNDLE, CLIP = ARTIFACTS / "synthetic-room-cjp-int8", ARTIFACTS / "synthetic-room-clip"
 _PROGRAM = "from cvo_edge.cli import main; main()"
-_LONGEST_S = 60.0
+_LONGEST_S, _ATTEMPTS = 60.0, 3
 
 
 def kills(count: int) -> Tally:
@@ -25,32 +26,45 @@ def kills(count: int) -> Tally:
 
     def trial(number: int) -> tuple[str, str | None]:
         generator = np.random.default_rng([2027, number])
-        wanted, more_s = int(generator.integers(1, 49)), float(generator.exponential(0.002))
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "records.jsonl"
-            process = subprocess.Popen(
-                [sys.executable, "-c", _PROGRAM, "run", BUNDLE, CLIP, "-o", path, "--threads", "1"],
-                stderr=subprocess.DEVNULL,
-            )
-            seen, late = 0, time.monotonic() + _LONGEST_S
-            while seen < wanted and process.poll() is None and time.monotonic() < late:
-                seen = path.read_bytes().count(b"\n") if path.exists() else 0
-                time.sleep(0.0005)
-            time.sleep(more_s)
-            # What the last look saw is what was acknowledged.
-            seen = path.read_bytes().count(b"\n") if path.exists() else 0
-            ended = process.poll() is not None
-            process.kill()
-            process.wait()
-            try:
-                records = [record.seq for record in read_records(path)]
-            except SourceError as error:
-                return "unreadable", str(error)
-            torn = not path.read_bytes().endswith(b"\n")
-            if records != list(range(len(records))) or len(records) < seen:
-                return "lost", f"{seen} records were seen, {len(records)} are there"
-            if ended:
-                return "had ended before", None
-            return "torn last line" if torn else "whole", None
+            for _ in range(_ATTEMPTS):
+                seen, code = _killed(path, generator)
+                if code == -signal.SIGKILL:
+                    return _what_is_left(path, seen)
+                if code != 0:
+                    return "ended", f"ended by itself with exit code {code}"
+        return "ended", "ended before it was killed, in each attempt"
 
     return beside_each_other(trial, count)
+
+
+def _killed(path: Path, generator: np.random.Generator) -> tuple[int, int]:
+    """Start a run and kill it -> records that a reader had seen before, and the exit code."""
+    wanted, more_s = int(generator.integers(1, 49)), float(generator.exponential(0.002))
+    path.unlink(missing_ok=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", _PROGRAM, "run", BUNDLE, CLIP, "-o", path, "--threads", "1"],
+        stderr=subprocess.DEVNULL,
+    )
+    late = time.monotonic() + _LONGEST_S
+    while _lines(path) < wanted and process.poll() is None and time.monotonic() < late:
+        time.sleep(0.0005)
+    time.sleep(more_s)
+    seen = _lines(path)
+    process.kill()
+    return seen, process.wait()
+
+
+def _lines(path: Path) -> int:
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def _what_is_left(path: Path, seen: int) -> tuple[str, str | None]:
+    try:
+        records = [record.seq for record in read_records(path)]
+    except SourceError as error:
+        return "unreadable", str(error)
+    if records != list(range(len(records))) or len(records) < seen:
+        return "lost", f"{seen} records were seen, {len(records)} are there"
+    return "whole" if path.read_bytes().endswith(b"\n") else "torn last line", None

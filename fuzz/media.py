@@ -77,7 +77,10 @@ def _picture(path: Path) -> NDArray[Any]:
 
 
 def videos(count: int) -> Tally:
-    """Change a video of 20 frames: read to its end, refused, or told that it ended early."""
+    """Change a video of 20 frames: read to its end, refused, or told that it ended early.
+
+    Its records are in order in any case.
+    """
 
     def trial(number: int) -> tuple[str, str | None]:
         generator = np.random.default_rng([2030, number])
@@ -85,10 +88,26 @@ def videos(count: int) -> Tally:
             path = Path(name) / "clip.avi"
             path.write_bytes(changed_bytes(_video(), generator))
             ended = command(["run", _BUNDLE, path, "--quiet", "--threads", 1])
-            finding = ended.misbehaviour((0, 6))
+            finding = ended.misbehaviour((0, 6)) or _out_of_order(ended.output)
             return f"exit code {ended.code}", finding
 
     return beside_each_other(trial, count)
+
+
+def _out_of_order(output: bytes) -> str | None:
+    """Return what is wrong with a video's records: numbers, names or times out of turn, or None."""
+    records = [json.loads(line) for line in output.splitlines(keepends=True)]
+    if [(record["seq"], record["source"]) for record in records] != [
+        (number, f"clip.avi#{number}") for number in range(len(records))
+    ]:
+        return "records out of order"
+    stamps = [record["stamp_ns"] for record in records if record["stamp_ns"] is not None]
+    if stamps != sorted(set(stamps)):
+        return "stamps out of order"
+    unseen = [record for record in records if record["status"] != "ok"]
+    if any(record["interval"] and record["interval"]["bounded"] for record in unseen):
+        return "an interval without a frame"
+    return None
 
 
 @cache

@@ -1,5 +1,6 @@
 """The command line as a user runs it: records, gates, exit codes, signals."""
 
+import fcntl
 import json
 import os
 import resource
@@ -184,6 +185,20 @@ def test_a_disk_that_fills_up_within_a_line_keeps_every_line_before_it(
         assert names == [json.loads(line)["source"] for line in whole[: len(kept)]]
     else:
         assert [line.count(",") for line in kept] == [whole[0].count(",")] * len(kept)
+
+
+def test_a_slow_reader_is_waited_for_also_where_another_process_would_not(bundle_dir, clip_dir):
+    receiver, sender = os.pipe()
+    fcntl.fcntl(receiver, fcntl.F_SETPIPE_SZ, 4096)
+    os.set_blocking(sender, False)
+    command = [*CVO_EDGE, "run", bundle_dir, clip_dir, "--quiet", "--max-frames", "40"]
+    with subprocess.Popen([*map(str, command)], stdout=sender, stderr=subprocess.PIPE) as process:
+        os.close(sender)
+        with os.fdopen(receiver, "rb") as stream:
+            time.sleep(2.0)
+            lines = stream.readlines()
+        assert process.wait(60) == 0, process.stderr.read()
+    assert len(lines) == 40
 
 
 def test_closed_or_full_standard_output_is_exit_7(bundle_dir):
@@ -406,6 +421,7 @@ def test_more_outputs_that_are_inputs_are_refused(copied_bundle, clip_dir, tmp_p
     calibration = copied_bundle / "calibration.json"
     kept = [path.read_bytes() for path in (image, key, calibration)]
     refused(cvo_edge("run", copied_bundle, images / "*.jpg", "-o", image), 2)
+    refused(cvo_edge("run", copied_bundle, tmp_path / "**" / "*.jpg", "-o", image), 2)
     refused(cvo_edge("run", copied_bundle, images, "--public-key", key, "-o", key), 2)
     refused(cvo_edge("bench", copied_bundle, "--frames", 1, "--json", calibration), 2)
     assert [path.read_bytes() for path in (image, key, calibration)] == kept

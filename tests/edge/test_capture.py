@@ -8,12 +8,15 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from cvo_edge import SourceError, UsageError, open_source, read_records
-from cvo_edge.capture import Arrivals
+from cvo_edge.capture import Arrivals, shown
 from cvo_edge.sources import PAUSES_S, Camera
 
 pytestmark = pytest.mark.clock
@@ -30,9 +33,10 @@ class NetworkCamera:
     """Motion JPEG over HTTP on loopback; ``lives`` says how each connection goes.
 
     Each is a number of frames, and how many seconds of silence come before it is closed.
+    ``gaps_s`` are between frames, in turns.
     """
 
-    def __init__(self, pictures, lives):
+    def __init__(self, pictures, lives, gaps_s=(0.02,)):
         camera, self.connections, self.sent_ns = self, 0, []
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -53,7 +57,7 @@ class NetworkCamera:
                         picture = pictures[k % len(pictures)]
                         camera.sent_ns.append(time.time_ns())
                         self.wfile.write(BOUNDARY % (len(picture), picture))
-                        time.sleep(0.02)
+                        time.sleep(gaps_s[k % len(gaps_s)])
                     camera.stopped.wait(silence_s)
                 except OSError:
                     pass  # it was given up
@@ -70,13 +74,19 @@ class NetworkCamera:
         self.server.server_close()
 
 
+def resized(content, size):
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    return cv2.imencode(".jpg", cv2.resize(picture, size))[1].tobytes()
+
+
 @pytest.fixture
 def network_camera(clip_dir):
     pictures = [path.read_bytes() for path in sorted(clip_dir.glob("*.jpg"))[:20]]
     cameras = []
 
-    def start(*lives):
-        cameras.append(NetworkCamera(pictures, lives))
+    def start(*lives, size=None, **options):
+        shown = pictures if size is None else [resized(picture, size) for picture in pictures]
+        cameras.append(NetworkCamera(shown, lives, **options))
         return cameras[-1]
 
     yield start
@@ -193,11 +203,19 @@ def test_a_signal_is_answered_within_a_second_while_a_read_blocks(
     assert len(list(read_records(records))) >= seen > 0
 
 
-@pytest.mark.parametrize("mode", ["live", "latency"])
+@pytest.mark.parametrize(
+    ("mode", "options"),
+    [
+        ("live", {}),
+        # A network's jitter, and pictures that take long to decode.
+        ("live", {"size": (1600, 1200), "gaps_s": (0.06, 0.06, 0.02, 0.1)}),
+        ("latency", {"size": (1600, 1200), "gaps_s": (0.06, 0.06, 0.02, 0.1)}),
+    ],
+)
 def test_what_lay_in_a_queue_while_the_process_was_stopped_has_no_interval(
-    network_camera, bundle_dir, tmp_path, mode
+    network_camera, bundle_dir, tmp_path, mode, options
 ):
-    camera = network_camera((1000, 0.0))
+    camera = network_camera((1000, 0.0), **options)
     records = tmp_path / "records.jsonl"
     arguments = ["run", bundle_dir, camera.address, "-o", records, "--mode", mode, "--threads", 1]
     process = subprocess.Popen([sys.executable, "-c", RUN, *map(str, arguments)])
@@ -293,20 +311,73 @@ def test_bench_connects_once(network_camera, bundle_dir):
 
 
 @pytest.mark.parametrize(
-    ("gaps", "waits", "queued"),
+    ("gaps", "queued"),
     [
-        # thirty a second, one pause of which 3 lie ready, and then it goes on
-        ([0.03] * 5 + [3.0] + [0.001] * 3 + [0.03] * 3, 0.03, [0] * 5 + [1] * 4 + [0] * 3),
-        # one every two seconds: twice it looks like a pause
-        ([0.2, 2.0, 2.0, 2.0, 2.0], 2.0, [0, 1, 1, 0, 0]),
-        # it took long to open, and its first frame is new
-        ([4.0, 0.03, 0.03], 0.03, [1, 0, 0]),
+        # thirty a second, one pause of which 3 lie ready, and then it goes on: told after a while
+        ([0.03] * 5 + [3.0] + [0.001] * 3 + [0.03] * 20, [0] * 5 + [1] * 18 + [0] * 6),
+        # all of the pause lies ready: told as soon as it is made up for
+        ([0.03] * 9 + [3.0] + [0.001] * 125, [0] * 9 + [1] * 116 + [0] * 10),
+        # one every two seconds: three times it looks like a pause
+        ([0.2, 2.0, 2.0, 2.0, 2.0, 2.0], [0, 1, 1, 1, 1, 0]),
+        # it took long to open: what came meanwhile may lie there
+        ([4.0] + [0.034] * 20, [1] * 16 + [0] * 5),
     ],
 )
-def test_what_comes_at_once_after_a_pause_is_old(gaps, waits, queued):
-    arrivals, now, found = Arrivals(0.0), 0.0, []
+def test_what_comes_sooner_than_usual_after_a_pause_is_old(gaps, queued):
+    arrivals, now, found = Arrivals(0.0, 30.0), 0.0, []
     for gap in gaps:
         now += gap
-        found.append(arrivals.queued_s(now - min(gap, waits), now))
-    assert [age > 0 for age in found] == [bool(value) for value in queued]
-    assert all(age in (0.0, max(gaps)) for age in found)
+        found.append(arrivals.queued_s(now))
+    assert [int(age > 0) for age in found] == queued
+    assert all(age in (0.0, *gaps) for age in found)
+
+
+def ages(period, jitter, decoding, pause, room, generator):
+    """(age, what is said of it) of frames that are read one after the other, with one pause."""
+    made = np.cumsum(period * generator.choice(jitter, 3000))
+    arrivals, now, taken, queue, found = Arrivals(0.0, 30.0), 0.0, 0, deque(), []
+    while taken < len(made):
+        while taken < len(made) and made[taken] <= now:
+            # A full queue loses what is new.
+            if len(queue) < room:
+                queue.append(made[taken])
+            taken += 1
+        if not queue:
+            now = made[min(taken, len(made) - 1)]
+            if taken == len(made):
+                break
+            continue
+        now += decoding * period * generator.choice([1.0, 1.0, 1.0, 1.5])
+        found.append((now - queue.popleft(), arrivals.queued_s(now)))
+        if len(found) == 100:
+            now += pause
+    return found
+
+
+@pytest.mark.parametrize("decoding", [0.02, 0.3, 0.6])
+@pytest.mark.parametrize("room", [4, 60, 10**6])
+@pytest.mark.parametrize("pause", [1.5, 5.0])
+@pytest.mark.parametrize("jitter", [[1.0], [0.8, 1.0, 1.2], [0.25, 1.0, 1.0, 1.75]])
+def test_no_frame_of_a_camera_with_a_queue_is_old_and_unsaid(decoding, room, pause, jitter):
+    for seed in range(5):
+        found = ages(0.033, jitter, decoding, pause, room, np.random.default_rng(seed))
+        assert all(said > 1.0 for age, said in found if age > 1.0)
+        # And what is new is believed again, soon.
+        wrongly = [said for age, said in found if said and age < 0.3]
+        assert len(wrongly) < 100
+        assert not any(said for _, said in found[-100:])
+
+
+def test_a_camera_that_turns_slow_or_fast_is_believed_again():
+    arrivals, now = Arrivals(0.0, 30.0), 0.0
+    for period in (0.03, 2.0, 0.03, 0.5, 0.02):
+        for _ in range(300):
+            now += period
+            said = arrivals.queued_s(now)
+        assert said == 0.0
+
+
+@pytest.mark.parametrize("address", ["http://u:secret@h/x", "rtsp://u:se@secret@h:1/x@y"])
+def test_a_password_is_not_shown(address):
+    assert "secret" not in shown(address)
+    assert shown(address).startswith(address.split(":")[0] + "://h")

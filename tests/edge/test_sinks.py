@@ -70,6 +70,12 @@ def test_tum_has_eight_columns_and_skips_what_has_no_pose(tmp_path, estimates):
     )
 
 
+@pytest.mark.parametrize(("stamp_ns", "text"), [(-1, "-0.000000001"), (-1_500_000_000, "-1.5")])
+def test_tum_times_before_zero_are_what_they_are(tmp_path, estimates, stamp_ns, text):
+    named = dataclasses.replace(estimates[0], stamp_ns=stamp_ns)
+    assert write(tmp_path / "a.txt", "tum", [named]).split()[0].rstrip("0") == text
+
+
 def test_tum_without_stamps_is_refused(tmp_path, bundle_dir, clip_dir):
     frame = next(iter(open_source(str(clip_dir))))
     with Odometer.load(bundle_dir) as odometer:

@@ -3,6 +3,8 @@
 import gc
 import os
 import re
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -176,23 +178,50 @@ def test_a_video_without_an_end_in_sight_ends(video):
 def test_stamps_are_where_the_container_puts_a_frame():
     """Of unequal lengths, too; an OpenCV that counts from a frame's end gives the same."""
     for shift_ms in (0.0, 40.0):
-        stamps = _VideoStamps(25.0, counted=False)
+        stamps = _VideoStamps(None, 25.0)
         found = [stamps.next(1, shift_ms + place) for place in (0.0, 40.0, 90.0, 120.0)]
         assert found == [[0], [40_000_000], [90_000_000], [120_000_000]]
         # Two that could not be read are put between.
         assert stamps.next(3, shift_ms + 240.0) == [160_000_000, 200_000_000, 240_000_000]
 
 
+def test_a_place_that_is_missing_costs_its_own_stamp_alone():
+    places = [0.0, 16.7, 33.3, 0.0, 66.7, 83.3, float("nan"), 133.3]
+    stamps = _VideoStamps(None, 30.0)
+    found = [1e-6 * stamps.next(1, place)[0] for place in places]
+    assert found == sorted(set(found))
+    assert [found[k] for k in (0, 1, 2, 4, 5, 7)] == pytest.approx(
+        [0, 16.7, 33.3, 66.7, 83.3, 133.3]
+    )
+
+
 @pytest.mark.parametrize("place", [0.0, -1.0, float("nan"), float("inf"), 1e300])
 def test_a_container_without_times_has_those_of_its_frame_rate(place):
-    stamps = _VideoStamps(25.0, counted=False)
+    stamps = _VideoStamps(None, 25.0)
     assert [stamps.next(1, place) for _ in range(3)] == [[0], [40_000_000], [80_000_000]]
     assert stamps.next(2, place) == [120_000_000, 160_000_000]
 
 
+@pytest.mark.parametrize("rate", [0.0, -1.0, 2.3e-10, 1e9, float("nan"), float("inf")])
+def test_a_rate_that_is_none_gives_no_stamps(rate):
+    assert _VideoStamps(None, rate).next(2, 40.0) == [None, None]
+
+
 def test_a_given_rate_is_taken_whatever_the_container_says():
-    stamps = _VideoStamps(10.0, counted=True)
+    stamps = _VideoStamps(10.0, 25.0)
     assert [stamps.next(1, 40.0 * seq) for seq in range(3)] == [[0], [100_000_000], [200_000_000]]
+
+
+def test_a_program_that_has_read_a_video_ends_as_it_wants_to(video):
+    """Python would end a thread that is within OpenCV then, and the process with it."""
+    script = (
+        "import sys; from cvo_edge import open_source; print(len(list(open_source(sys.argv[1]))))"
+    )
+    for _ in range(5):
+        done = subprocess.run(
+            [sys.executable, "-c", script, video], capture_output=True, text=True, check=False
+        )
+        assert (done.returncode, done.stdout) == (0, "20\n"), done.stderr
 
 
 def test_a_text_file_is_no_video(tmp_path):
