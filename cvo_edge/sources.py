@@ -6,6 +6,7 @@ import glob
 import logging
 import math
 import re
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from numpy.typing import NDArray
 
-from cvo_edge.capture import READER, TIMEOUT_S, Capture, Grabbed, shown
+from cvo_edge.capture import READER, TIMEOUT_S, Capture, shown
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.files import read_regular_file
 from cvo_edge.images import MAX_IMAGE_BYTES, decode_image
@@ -254,11 +255,16 @@ class Camera:
     """A camera by index, device path or address; stamps are the clock's when a frame arrived.
 
     One that does not open, or gives no frame for ``timeout_s``, is given up and opened again, a few
-    times, after ever longer pauses. Its frames are to be taken as they come, as
-    ``Odometer.stream`` does in every mode: what nobody takes lies in queues of drivers.
+    times, after ever longer pauses. A frame that does not decode has no image.
+
+    Its frames are to be taken as they come, as ``Odometer.stream`` does in every mode: what nobody
+    takes lies in queues of drivers.
     """
 
     live = True
+
+    # So many in a row are an end.
+    _UNREADABLE_IN_A_ROW = 5
 
     def __init__(self, device: int | str, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
         self._device, self._fps, self._timeout_s = device, fps, timeout_s
@@ -283,19 +289,17 @@ class Camera:
         seq = 0
         try:
             while not self._stopped.is_set():
-                grabbed = self._insisting(self._grabbed)
-                if grabbed is None:
+                frames = self._insisting(self._next)
+                if frames is None:
                     return
                 self._since_opened += 1
                 if self._since_opened > 1:
                     # One frame a connection is what an address of single pictures gives.
                     self._failures = 0
-                stamp_ns = _stamp(seq, self._fps) if self._fps else grabbed.stamp_ns
-                name = f"{shown(self._device)}#{seq}"
-                yield Frame(
-                    grabbed.image, stamp_ns, name, grabbed.decode_ms, waited_ms=grabbed.queued_ms
-                )
-                seq += 1
+                for frame in frames:
+                    stamp_ns = _stamp(seq, self._fps) if self._fps else frame.stamp_ns
+                    yield replace(frame, stamp_ns=stamp_ns, source=f"{shown(self._device)}#{seq}")
+                    seq += 1
         finally:
             self._close()
 
@@ -310,8 +314,16 @@ class Camera:
             capture.open()
         return capture
 
-    def _grabbed(self) -> Grabbed | None:
-        return self._opened().read()
+    def _next(self) -> list[Frame] | None:
+        """The next frame that decodes, behind those that do not; None at the end."""
+        frames: list[Frame] = []
+        capture = self._opened()
+        while len(frames) < self._UNREADABLE_IN_A_ROW:
+            if (grabbed := capture.read()) is not None:
+                read_ms, queued_ms = grabbed.decode_ms, grabbed.queued_ms
+                return [*frames, Frame(grabbed.image, grabbed.stamp_ns, "", read_ms, queued_ms)]
+            frames.append(Frame(None, time.time_ns(), "", 0.0))
+        return None
 
     def _close(self) -> None:
         capture, self._capture = self._capture, None

@@ -118,6 +118,25 @@ def test_a_stream_that_hangs_or_ends_is_opened_again_and_goes_on(network_camera,
     assert ["within 0.5 s, found none" in problems[0], "found its end" in problems[1]] == [True] * 2
 
 
+@pytest.mark.parametrize("damage", ["nothing", "zeros", "no header"])
+def test_a_damaged_frame_of_a_camera_costs_itself_alone(clip_dir, damage):
+    pictures = [path.read_bytes() for path in sorted(clip_dir.glob("*.jpg"))[:30]]
+    whole = pictures[10]
+    pictures[10] = {
+        "nothing": whole,
+        "zeros": bytes(len(whole)),
+        "no header": bytes(200) + whole[200:],
+    }[damage]
+    camera = NetworkCamera(pictures, [(1000, 0.0)])
+    frames = list(zip(range(25), open_source(camera.address), strict=False))
+    camera.close()
+    assert camera.connections == 1
+    unreadable = [frame.source for _, frame in frames if frame.image is None]
+    assert unreadable == ([] if damage == "nothing" else [f"{camera.address}#10"])
+    stamps = [frame.stamp_ns for _, frame in frames]
+    assert stamps == sorted(set(stamps))
+
+
 def open_files():
     return len(list(Path("/proc/self/fd").iterdir()))
 
