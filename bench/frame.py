@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ class Timed:
     """The calls on one bundle; ``conformal_ms`` is what follows the network in each ``step``.
 
     An array is one that has just been written, as a camera or a decoder leaves it; so is the input
-    of the bare call.
+    of the bare call. The same picture again, soon, would be a frozen camera's.
     """
 
     def __init__(self, bundle: Bundle, sink: Sink, scope: Scope = "marginal") -> None:
@@ -56,8 +57,8 @@ class Timed:
         self._odometer = Odometer(bundle, threads=THREADS, scope=scope)
         self._alone = Session(pose_alone(bundle.model_bytes), THREADS)
         self._sink = sink
-        self._pictures, self._files = images(), frames()
-        self._image = np.empty_like(self._pictures[0])
+        self._pictures, self._files = cycle(images()), cycle(frames())
+        self._image = next(self._pictures).copy()
         self._feeds = dict(self._odometer.head.extra_inputs(0))
 
     def calls(self) -> dict[str, Callable[[int], object]]:
@@ -78,9 +79,9 @@ class Timed:
             "pose_alone": self.write_image,
         }
 
-    def write_image(self, number: int) -> None:
+    def write_image(self, _: int) -> None:
         """Write the next picture."""
-        np.copyto(self._image, self._pictures[number % len(self._pictures)])
+        np.copyto(self._image, next(self._pictures))
 
     def write_input(self, number: int) -> None:
         """Write the network's input for the next picture."""
@@ -99,9 +100,9 @@ class Timed:
             raise SystemExit(f"frame {number}: expected finite intervals, found none")
         self.conformal_ms.append(estimate.latency_ms["conformal"])
 
-    def record(self, number: int) -> None:
+    def record(self, _: int) -> None:
         """From a JPEG file to a line in a file."""
-        path = self._files[number % len(self._files)]
+        path = next(self._files)
         image = decode_image(path.read_bytes())
         self._sink.write(self._odometer.step(image, source=path.name))
 
