@@ -23,8 +23,10 @@ MAX_IMAGE_BYTES = 1 << 29
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 _JPEG_END, _JPEG_SCAN = b"\xff\xd9", b"\xff\xda"
-# Each pass over a progressive picture takes as long as one picture; cameras write one, tools ten.
+# Each pass over a picture takes as long as one picture; cameras write one, tools ten.
 _MOST_SCANS = 64
+# Frames that have one scan where that is of all their components: not progressive (T.81, B.1.1.3).
+_SEQUENTIAL = frozenset((0xC0, 0xC1, 0xC9))
 # Markers without a length belong into data; what hides behind one is not what a decoder sees.
 _BARE = frozenset((0x01, *range(0xD0, 0xDA)))
 # Decoders differ in whether a comment ends with a carriage return: one that has it is refused.
@@ -72,7 +74,7 @@ def image_size(content: bytes) -> tuple[int, int] | None:
 
 def _jpeg(content: bytes) -> tuple[int, int] | None:
     """Of the frame header; None where the end of the image is not behind the start of its data."""
-    size, position = None, 2
+    size, components, position = None, 0, 2
     while content[position] == 0xFF:
         marker = content[position + 1]
         if marker == 0xFF:  # fill
@@ -84,13 +86,17 @@ def _jpeg(content: bytes) -> tuple[int, int] | None:
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             if size is not None:
                 return None
-            height, width = struct.unpack_from(">HH", content, position + 5)
+            height, width, components = struct.unpack_from(">HHB", content, position + 5)
             size = height, width
-        position += 2 + length
+            if marker not in _SEQUENTIAL:
+                components = 0
         if marker == 0xDA:
+            alone = content[position + 4] == components
             # Within data 0xff is never followed by either.
-            ends = content.rfind(_JPEG_END) >= position
-            return size if ends and content.count(_JPEG_SCAN) <= _MOST_SCANS else None
+            whole = content.rfind(_JPEG_END) >= position + 2 + length
+            few = alone or content.count(_JPEG_SCAN) <= _MOST_SCANS
+            return size if whole and few else None
+        position += 2 + length
     return None
 
 

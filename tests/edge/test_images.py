@@ -296,3 +296,18 @@ def test_a_picture_of_many_passes_is_refused_and_one_of_ten_is_not():
     assert decode_image(jpeg) is not None
     scan = jpeg[jpeg.rindex(b"\xff\xda") : -2]
     assert decode_image(jpeg[:-2] + 100 * scan + jpeg[-2:]) is None
+
+
+@pytest.mark.parametrize("frame", [b"\xff\xc0", b"\xff\xc1"])
+def test_scans_are_counted_where_a_decoder_reads_more_than_one(frame):
+    """A first scan of all components is the only one, whatever is behind; one of fewer is not."""
+    jpeg = cv2.imencode(".jpg", picture())[1].tobytes().replace(b"\xff\xc0", frame, 1)
+    start = jpeg.index(b"\xff\xda")
+    assert jpeg[start + 4] == 3
+    many = jpeg[:-2] + 100 * jpeg[start:]
+    assert image_size(many) == image_size(jpeg) is not None
+    decoded = decode_image(many)
+    assert decoded is None or np.array_equal(decoded, decode_image(jpeg))
+    for scans in (1, 100):
+        planar = jpeg[:start] + scans * (b"\xff\xda\x00\x08\x01\x01\x00\x00\x3f\x00") + jpeg[-2:]
+        assert (image_size(planar) is None) == (scans > 64)
