@@ -166,11 +166,11 @@ class _Opened:
 
     def __init__(self) -> None:
         self._capture = cv2.VideoCapture()
-        self._arrivals = Arrivals(perf_counter(), 0.0)
+        self._arrivals = Arrivals(_now(), 0.0)
 
     def open(self, device: int | str) -> tuple[float, int] | None:
         """Open it -> frames a second and their number, as the container says; None if it is not."""
-        begin = perf_counter()
+        begin = _now()
         try:
             if not self._capture.open(device):
                 return None
@@ -200,7 +200,7 @@ class _Opened:
             position_ms=position_ms,
             decode_ms=1e3 * (end - come),
             read_ms=1e3 * (end - begin),
-            queued_ms=1e3 * self._arrivals.queued_s(come),
+            queued_ms=1e3 * self._arrivals.queued_s(_now()),
         )
 
     def release(self) -> None:
@@ -208,61 +208,79 @@ class _Opened:
         self._capture.release()
 
 
+def _now() -> float:
+    """Seconds of a clock that goes on while the machine sleeps, where there is one."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
 class Arrivals:
-    """Which frames of a camera may have waited in a queue, behind a pause.
+    """Which frames of a camera may have waited in a queue, and how long.
 
     Drivers, networks and decoders keep frames that nobody takes. Whoever takes them all, one after
-    the other, is always ahead; after a pause, of this process or of the camera, those that were
-    kept come faster than a camera gives them, and are old until that ends.
+    the other, is always ahead. What comes later than usual leaves a lag, which frames that come
+    sooner make up for; as long as there is a lag, frames may be as old. It is over when it is made
+    up for, or when frames come no sooner than usual, as the queue is empty then.
     """
 
-    # Shorter pauses leave nothing behind that matters; a slow camera's own are no pauses.
-    _PAUSE_S, _USUAL_GAPS = 1.0, 3.0
-    # So many gaps tell the usual one, and so many, or so long a time, whether it is that again.
+    # A lag that matters.
+    _LAG_S = 1.0
+    # No queue holds more.
+    _MOST_S = 60.0
+    # Until so many gaps are known they are taken for those of a camera of 30 a second, or of 60 if
+    # it says so; and no frame makes up for more than that.
+    _FEW, _FPS, _MOST_FPS, _LATE_S = 8, 30.0, 60.0, 1.0
     _USUAL, _SOME, _SOME_S = 64, 16, 2.0
-    # Gaps nearly as long as usual: the queue is empty, and each frame is waited for.
-    _AS_USUAL = 0.9
-    # So many pauses in a row are a camera's own rate.
-    _RATE = 3
-    _FPS, _LOWEST_FPS, _HIGHEST_FPS = 30.0, 0.01, 1000.0
+    # No sooner than usual, nearly; and far later.
+    _AS_USUAL, _LATE = 0.9, 3.0
+    # Even a decoder that is hardly faster than the camera has emptied a queue by then.
+    _LONGEST = 10.0
 
     def __init__(self, opened_at: float, claimed_fps: float) -> None:
         self._last, self._first = opened_at, True
-        believable = self._LOWEST_FPS <= claimed_fps <= self._HIGHEST_FPS
-        # Until some are known.
-        self._claimed_s = 1.0 / (claimed_fps if believable else self._FPS)
+        fast = self._FPS < claimed_fps < math.inf
+        self._gap_s = 1.0 / (min(claimed_fps, self._MOST_FPS) if fast else self._FPS)
         self._gaps: deque[float] = deque(maxlen=self._USUAL)
-        self._pause_s = self._behind_s = 0.0
-        self._pauses = 0
         self._since: deque[float] = deque(maxlen=self._SOME)
+        self._recent: deque[float] = deque(maxlen=self._SOME)
+        self._lag_s = self._largest_s = self._spent_s = 0.0
 
     def queued_s(self, come: float) -> float:
-        """Seconds that the frame which came now may have waited: the last pause, or nothing.
+        """Seconds that the frame which came now may have waited, 0 where it is no more than one.
 
         ``come`` in seconds of the clock of ``opened_at``.
         """
         gap, self._last = come - self._last, come
         first, self._first = self._first, False
-        usual = fmean(self._gaps) if self._gaps else self._claimed_s
-        if gap > max(self._PAUSE_S, self._USUAL_GAPS * usual):
-            self._pauses += 1
-            if self._pauses >= self._RATE:
-                self._gaps.clear()
-                self._gaps.append(gap)
-            self._pause_s = self._behind_s = gap
+        known = len(self._gaps) >= self._FEW
+        usual = fmean(self._gaps) if known else self._gap_s
+        late_s = self._LATE * usual if known else self._LATE_S
+        made_up = self._AS_USUAL * usual
+        self._lag_s = min(max(0.0, self._lag_s + gap - made_up), self._MOST_S)
+        # What it took to open says nothing of a rate.
+        if not first:
+            self._recent.append(gap)
+        if first or gap > late_s:
             self._since.clear()
-            return gap
-        self._pauses = 0
-        if not self._pause_s:
-            # The first one is behind the opening, not behind another frame.
-            if not first:
+            self._spent_s = 0.0
+            if 2 * sum(each > late_s for each in self._recent) >= self._SOME:
+                # No pauses any more: a camera that has become slow.
+                self._gaps.clear()
+                self._gaps.extend(self._recent)
+        else:
+            self._since.append(gap)
+            self._spent_s += gap
+            if self._is_empty(usual):
+                self._lag_s = 0.0
+            if self._lag_s <= late_s:
                 self._gaps.append(gap)
-            return 0.0
-        self._since.append(gap)
-        waited_for = self._AS_USUAL * usual
-        # Each that came sooner made up for a part of the pause.
-        self._behind_s -= waited_for - gap
+        if self._lag_s > self._LAG_S or (self._largest_s and self._lag_s):
+            self._largest_s = max(self._largest_s, self._lag_s)
+        else:
+            self._largest_s = 0.0
+        return self._largest_s
+
+    def _is_empty(self, usual: float) -> bool:
         some = len(self._since) == self._SOME or sum(self._since) > self._SOME_S
-        if self._behind_s <= 0.0 or (some and fmean(self._since) >= waited_for):
-            self._pause_s = 0.0
-        return self._pause_s
+        return (some and fmean(self._since) >= self._AS_USUAL * usual) or (
+            self._spent_s > self._LONGEST * self._largest_s > 0.0
+        )

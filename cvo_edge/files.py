@@ -44,7 +44,7 @@ def read_regular_file(
     with regular_file(path, limit, error, links=links) as stream:
         try:
             # Room for as much as it had is made faster than for as much as it may have.
-            size = os.fstat(stream.fileno()).st_size
+            size = min(os.fstat(stream.fileno()).st_size, limit)
             content = stream.read(size + 1)
             if len(content) > size:
                 content += stream.read(limit + 1 - len(content))

@@ -23,6 +23,8 @@ MAX_IMAGE_BYTES = 1 << 29
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 _JPEG_END, _JPEG_SCAN = b"\xff\xd9", b"\xff\xda"
+# Segments and chunks before the picture; cameras write ten of them, 64 KiB each at most in a JPEG.
+_MOST_PARTS = 4096
 # Each pass over a picture takes as long as one picture; cameras write one, tools ten.
 _MOST_SCANS = 64
 # Frames that have one scan where that is of all their components: not progressive (T.81, B.1.1.3).
@@ -75,7 +77,9 @@ def image_size(content: bytes) -> tuple[int, int] | None:
 def _jpeg(content: bytes) -> tuple[int, int] | None:
     """Of the frame header; None where the end of the image is not behind the start of its data."""
     size, components, position = None, 0, 2
-    while content[position] == 0xFF:
+    for _ in range(_MOST_PARTS):
+        if content[position] != 0xFF:
+            return None
         marker = content[position + 1]
         if marker == 0xFF:  # fill
             position += 1
@@ -91,7 +95,7 @@ def _jpeg(content: bytes) -> tuple[int, int] | None:
             if marker not in _SEQUENTIAL:
                 components = 0
         if marker == 0xDA:
-            alone = content[position + 4] == components
+            alone = 0 < components == content[position + 4]
             # Within data 0xff is never followed by either.
             whole = content.rfind(_JPEG_END) >= position + 2 + length
             few = alone or content.count(_JPEG_SCAN) <= _MOST_SCANS
@@ -142,7 +146,7 @@ def _webp(content: bytes) -> tuple[int, int] | None:
     if content[8:12] != b"WEBP":
         return None
     canvas, position = None, 12
-    while True:
+    for _ in range(_MOST_PARTS):
         kind, length = struct.unpack_from("<4sI", content, position)
         data = position + 8
         if kind == b"VP8X":
@@ -159,6 +163,8 @@ def _webp(content: bytes) -> tuple[int, int] | None:
             size = (bits >> 14 & 0x3FFF) + 1, (bits & 0x3FFF) + 1
             break
         position = data + length + length % 2
+    else:
+        return None
     return size if canvas in (None, size) else None
 
 

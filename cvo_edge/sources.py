@@ -223,9 +223,8 @@ class _VideoStamps:
     def __init__(self, fps: float | None, own_fps: float) -> None:
         self._fps = fps
         believable = LOWEST_FPS <= own_fps <= HIGHEST_FPS
-        # What is added where there is no later time; None where there is none at all.
-        self._step_ns = 1e9 / own_fps if believable else None
-        self._seq = 0
+        self._gap_ns = 1e9 / own_fps if believable else None
+        self._seq, self._has_times = 0, False
         self._origin_ms, self._last_ns = math.nan, 0.0
 
     def next(self, count: int, position_ms: float) -> list[int | None]:
@@ -236,17 +235,18 @@ class _VideoStamps:
         begin, self._seq = self._seq, self._seq + count
         if self._fps is not None:
             return [_stamp(seq, self._fps) for seq in range(begin, self._seq)]
-        if self._step_ns is None:
+        if self._gap_ns is None:
             return [None] * count
-        last_ns = -self._step_ns if begin == 0 else self._last_ns
+        last_ns = self._last_ns
         if begin == 0:
-            self._origin_ms = position_ms - 1e-6 * self._step_ns * (count - 1)
+            last_ns = -self._gap_ns
+            self._origin_ms = position_ms - 1e-6 * self._gap_ns * (count - 1)
         now_ns = 1e6 * (position_ms - self._origin_ms)
-        if not last_ns < now_ns < self._END_NS:
-            now_ns = last_ns + self._step_ns * count
-        elif begin > 0:
-            # Half of it, so that its next time is a later one again.
-            self._step_ns = 0.5 * (now_ns - last_ns) / count
+        if last_ns < now_ns < self._END_NS:
+            self._has_times = begin > 0
+        else:
+            # Half a frame where others have times, so that the next one's is a later one again.
+            now_ns = last_ns + self._gap_ns * (0.5 if self._has_times else count)
         self._last_ns = now_ns
         return [round(last_ns + (now_ns - last_ns) * (k + 1) / count) for k in range(count)]
 
@@ -317,8 +317,8 @@ class Camera:
     def _next(self) -> list[Frame] | None:
         """The next frame that decodes, behind those that do not; None at the end."""
         frames: list[Frame] = []
-        capture = self._opened()
-        while len(frames) < self._UNREADABLE_IN_A_ROW:
+        capture, late = self._opened(), time.monotonic() + self._timeout_s
+        while len(frames) < self._UNREADABLE_IN_A_ROW and time.monotonic() < late:
             if (grabbed := capture.read()) is not None:
                 read_ms, queued_ms = grabbed.decode_ms, grabbed.queued_ms
                 return [*frames, Frame(grabbed.image, grabbed.stamp_ns, "", read_ms, queued_ms)]

@@ -29,7 +29,10 @@ def kills(count: int) -> Tally:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "records.jsonl"
             for _ in range(_ATTEMPTS):
-                seen, code = _killed(path, generator)
+                try:
+                    seen, code = _killed(path, generator)
+                except RuntimeError as hang:
+                    return "hangs", str(hang)
                 if code == -signal.SIGKILL:
                     return _what_is_left(path, seen)
                 if code != 0:
@@ -47,12 +50,16 @@ def _killed(path: Path, generator: np.random.Generator) -> tuple[int, int]:
         [sys.executable, "-c", _PROGRAM, "run", BUNDLE, CLIP, "-o", path, "--threads", "1"],
         stderr=subprocess.DEVNULL,
     )
-    late = time.monotonic() + _LONGEST_S
-    while _lines(path) < wanted and process.poll() is None and time.monotonic() < late:
-        time.sleep(0.0005)
-    time.sleep(more_s)
-    seen = _lines(path)
-    process.kill()
+    try:
+        late = time.monotonic() + _LONGEST_S
+        while _lines(path) < wanted and process.poll() is None:
+            if time.monotonic() > late:
+                raise RuntimeError(f"expected {wanted} records within {_LONGEST_S:g} s")
+            time.sleep(0.0005)
+        time.sleep(more_s)
+        seen = _lines(path)
+    finally:
+        process.kill()
     return seen, process.wait()
 
 
@@ -67,4 +74,5 @@ def _what_is_left(path: Path, seen: int) -> tuple[str, str | None]:
         return "unreadable", str(error)
     if records != list(range(len(records))) or len(records) < seen:
         return "lost", f"{seen} records were seen, {len(records)} are there"
-    return "whole" if path.read_bytes().endswith(b"\n") else "torn last line", None
+    torn = path.read_bytes()[-1:] not in (b"", b"\n")
+    return "torn last line" if torn else "whole", None

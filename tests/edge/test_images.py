@@ -311,3 +311,16 @@ def test_scans_are_counted_where_a_decoder_reads_more_than_one(frame):
     for scans in (1, 100):
         planar = jpeg[:start] + scans * (b"\xff\xda\x00\x08\x01\x01\x00\x00\x3f\x00") + jpeg[-2:]
         assert (image_size(planar) is None) == (scans > 64)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xff\xd8" + bytes([0xFF]) * 10**7,
+        b"\xff\xd8" + b"\xff\xe0\x00\x02" * 10**6,
+        b"RIFF\0\0\0\0WEBP" + b"abcd\0\0\0\0" * 10**6,
+    ],
+)
+def test_a_header_without_an_end_in_sight_is_none(content):
+    for _ in range(100):
+        assert image_size(content) is None
