@@ -6,7 +6,7 @@ import hashlib
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -58,11 +58,7 @@ def artifacts(count: int) -> Tally:
     def trial(number: int) -> tuple[str, str | None]:
         with _copy(number) as (bundle, generator):
             path = bundle / CALIBRATION_FILE
-            content = path.read_bytes()
-            if generator.random() < 0.5:
-                content = changed_document(json.loads(content), generator)
-            else:
-                content = changed_bytes(content, generator)
+            content = _changed(path, _changed_values, 0.5, generator)
             path.write_bytes(content)
             return _refused(bundle, (CalibrationFileError,))
 
@@ -86,11 +82,7 @@ def models_that_fit(count: int) -> Tally:
     def trial(number: int) -> tuple[str, str | None]:
         with _copy(number) as (bundle, generator):
             path = bundle / MODEL_FILE
-            content = path.read_bytes()
-            if generator.random() < 0.75:
-                content = _changed_graph(content, generator)
-            else:
-                content = changed_bytes(content, generator)
+            content = _changed(path, _changed_graph, 0.75, generator)
             path.write_bytes(content)
             calibration = bundle / CALIBRATION_FILE
             document = json.loads(calibration.read_bytes())
@@ -107,15 +99,24 @@ def artifacts_that_fit(count: int) -> Tally:
     def trial(number: int) -> tuple[str, str | None]:
         with _copy(number) as (bundle, generator):
             path = bundle / CALIBRATION_FILE
-            content = path.read_bytes()
-            if generator.random() < 0.75:
-                content = changed_document(json.loads(content), generator)
-            else:
-                content = changed_bytes(content, generator)
+            content = _changed(path, _changed_values, 0.75, generator)
             path.write_bytes(with_digest(content))
             return _verified(bundle)
 
     return beside_each_other(trial, count)
+
+
+def _changed(
+    path: Path, inside: Callable[[bytes, Generator], bytes], share: float, generator: Generator
+) -> bytes:
+    """Return a file's content changed: so often within its format, else some of its bytes."""
+    change = inside if generator.random() < share else changed_bytes
+    return change(path.read_bytes(), generator)
+
+
+def _changed_values(content: bytes, generator: Generator) -> bytes:
+    """Return a document with other values, keys or elements."""
+    return changed_document(json.loads(content), generator)
 
 
 def _verified(bundle: Path) -> tuple[str, str | None]:
