@@ -18,7 +18,7 @@ help:
 	@echo "make check   lint, formatting, types and import rules"
 	@echo "make bench   compare speed, memory and start side by side; an hour on a quiet machine"
 	@echo "make soak    a million frames: does memory grow? half an hour"
-	@echo "make fuzz    ten thousand damaged models, artifacts and sensors, a thousand kills; an hour"
+	@echo "make fuzz    ten thousand damaged models, artifacts and sensors, a thousand kills; half an hour"
 	@echo "make format  reformat the code"
 	@echo "make clean   remove the virtual environments, emulated boards and networks of make bench"
 

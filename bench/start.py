@@ -2,10 +2,11 @@
 
     python bench/start.py
 
-Every figure is of fresh processes, in turns: onnxruntime as it comes on the float32 model, and
-``Odometer.load`` with a warm cache of prepared models, in both precisions. Then whole processes:
-the smallest script of onnxruntime and OpenCV that gives a pose of one JPEG file, and ``cvo-edge
-run`` on the same file. Modules are compiled once, before, as an installation does it.
+Every figure is of fresh processes, in turns: onnxruntime as it comes on the float32 model, with as
+many threads as ours and with one, beside which none spins; and ``Odometer.load`` with a warm cache
+of prepared models, in both precisions. Then whole processes: the smallest script of onnxruntime and
+OpenCV that gives a pose of one JPEG file, and ``cvo-edge run`` on the same file. Modules are
+compiled once, before, as an installation does it.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import json, sys
 from time import perf_counter
 import cv2, numpy, onnxruntime
 options = onnxruntime.SessionOptions()
-options.intra_op_num_threads = 2
+options.intra_op_num_threads = int(sys.argv[2])
 begin = perf_counter()
 session = onnxruntime.InferenceSession(sys.argv[1] + "/model.onnx", options)
 load_ms = 1e3 * (perf_counter() - begin)
@@ -64,7 +65,8 @@ def loaded(backbone: str) -> dict[str, Any]:
     """Load times and anonymous memory of each, and their ratios to onnxruntime as it comes."""
     plain, int8 = (str(whole_bundle(METHOD, backbone, p)) for p in ("fp32", "int8"))
     commands = {
-        "onnxruntime": [PLAIN, plain],
+        "onnxruntime": [PLAIN, plain, str(THREADS)],
+        "onnxruntime, one thread": [PLAIN, plain, "1"],
         "cvo-edge fp32": [OURS, plain],
         "cvo-edge int8": [OURS, int8],
     }
@@ -120,7 +122,7 @@ def main() -> None:
         for name, row in results[backbone]["load"].items():
             load, memory = row["load_ms"], row["anonymous_mib"]
             print(
-                f"{backbone:<16} {name:<14} load {load['median']:7.1f} ms "
+                f"{backbone:<16} {name:<23} load {load['median']:7.1f} ms "
                 f"({load['over_onnxruntime']:.3f}), anonymous {memory['median']:6.1f} MiB "
                 f"({memory['over_onnxruntime']:.3f})",
                 flush=True,

@@ -222,8 +222,9 @@ class Arrivals:
     up for, or when frames come no sooner than usual, as the queue is empty then.
     """
 
-    # A lag that matters.
+    # A lag that matters, and how far a camera's jitter may have it wrong.
     _LAG_S = 1.0
+    _JITTER, _JITTER_S = 3.0, 0.25
     # No queue holds more.
     _MOST_S = 60.0
     # Until so many gaps are known they are taken for those of a camera of 30 a second, or of 60 if
@@ -273,8 +274,9 @@ class Arrivals:
                 self._lag_s = 0.0
             if self._lag_s <= late_s:
                 self._gaps.append(gap)
-        if self._lag_s > self._LAG_S or (self._largest_s and self._lag_s):
-            self._largest_s = max(self._largest_s, self._lag_s)
+        most_s = self._lag_s + min(self._JITTER * usual, self._JITTER_S)
+        if most_s > self._LAG_S or (self._largest_s and self._lag_s):
+            self._largest_s = max(self._largest_s, most_s)
         else:
             self._largest_s = 0.0
         return self._largest_s

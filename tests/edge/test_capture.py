@@ -1,6 +1,7 @@
 """Cameras that end, hang and come back: real streams over loopback and pipes."""
 
 import http.server
+import itertools
 import os
 import signal
 import socket
@@ -383,17 +384,13 @@ PAUSES = (
 )
 
 
-@pytest.mark.parametrize("decoding", [0.02, 0.3, 0.6])
-@pytest.mark.parametrize("room", [4, 60, 10**6])
 @pytest.mark.parametrize("pauses", PAUSES)
 @pytest.mark.parametrize("jitter", [[1.0], [0.8, 1.0, 1.2], [0.25, 1.0, 1.0, 1.75]])
 @pytest.mark.parametrize("period", [1 / 60, 1 / 30, 0.1])
-def test_no_frame_of_a_camera_with_a_queue_is_old_and_unsaid(
-    period, decoding, room, pauses, jitter
-):
-    for seed in range(3):
+def test_no_frame_of_a_camera_with_a_queue_is_old_and_unsaid(period, pauses, jitter):
+    for decoding, room, seed in itertools.product([0.02, 0.3, 0.6], [4, 10**6], range(2)):
         found = ages(period, jitter, decoding, pauses, room, np.random.default_rng(seed))
-        assert all(said > 1.0 for age, said in found if age > 1.2)
+        assert all(said > 1.0 for age, said in found if age > 1.0)
         # And what is new is believed again, soon.
         assert sum(said > 0.0 and age < 0.3 for age, said in found) < 100
         assert not any(said for _, said in found[-100:])
