@@ -77,6 +77,7 @@ class Board:
 
 
 _WITHOUT_NETWORKS = ("conformal", "geometry", "heads", "pose", "preprocess", "trajectory")
+_PREPARED = "tests/edge/test_prepared.py::test_a_prepared_model_computes_the_very_same"
 
 BOARDS = {
     board.name: board
@@ -98,7 +99,10 @@ BOARDS = {
             "Haswell-noTSX,-pcid,-x2apic,-tsc-deadline,-invpcid",
             saturates=True,
             # In float32 a frame takes that emulator 18 seconds, in 8 bits one.
-            tests=tuple(f"tests/edge/test_{name}.py" for name in _WITHOUT_NETWORKS),
+            tests=(
+                *(f"tests/edge/test_{name}.py" for name in _WITHOUT_NETWORKS),
+                f"{_PREPARED}[cjp-int8]",
+            ),
             compared=("int8",),
         ),
     )

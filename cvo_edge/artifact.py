@@ -39,17 +39,21 @@ Text = Annotated[
     str, Meta(min_length=1, max_length=200, pattern="^[^\x00-\x1f\x7f-\x9f\ud800-\udfff]+$(?!\n)")
 ]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$(?!\n)")]
-Positive = Annotated[float, Meta(gt=0)]
-Six = tuple[float, float, float, float, float, float]
+# Metres, radians, probabilities, scales: no output, and no number of a calibration, is near this.
+MAX_NUMBER = 1e9
+Number = Annotated[float, Meta(gt=-MAX_NUMBER, lt=MAX_NUMBER)]
+Positive = Annotated[float, Meta(gt=0, lt=MAX_NUMBER)]
+Six = tuple[Number, Number, Number, Number, Number, Number]
 SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
+NumberOrNone = Number | None
 SixOrUnbounded = tuple[
-    float | None, float | None, float | None, float | None, float | None, float | None
+    NumberOrNone, NumberOrNone, NumberOrNone, NumberOrNone, NumberOrNone, NumberOrNone
 ]
 Dtype = Literal["uint8", "float32"]
 Precision = Literal["fp32", "int8"]
 Provider = Literal["onnxruntime", "openvino"]
 MethodName = Literal["cqr", "csp", "mcqr", "cjp"]
-Quaternion = tuple[float, float, float, float]
+Quaternion = tuple[Number, Number, Number, Number]
 Parameters = TypeVar("Parameters", bound=Struct)
 
 
@@ -92,7 +96,7 @@ class PreprocessSpec(_Strict, frozen=True):
     colour_order: Literal["rgb"]
     interpolation: Literal["halve_then_linear_exact"]
     crop: Crop
-    mean: tuple[float, float, float] | None
+    mean: tuple[Number, Number, Number] | None
     std: tuple[Positive, Positive, Positive] | None
     layout: Literal["nhwc"]
     in_graph: tuple[Literal["cast"], Literal["transpose"], Literal["normalise"]]
@@ -171,7 +175,7 @@ class SelfTest(_Strict, frozen=True):
     recipe: Literal["ripples-1"]
     height: Annotated[int, Meta(ge=16, le=4096)]
     width: Annotated[int, Meta(ge=16, le=4096)]
-    outputs: dict[Text, tuple[float, ...]]
+    outputs: dict[Text, tuple[Number, ...]]
     tolerance: Annotated[float, Meta(gt=0, le=1)]
 
 

@@ -6,6 +6,7 @@ caller waits for an answer instead, for a bounded time; the thread that never an
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import re
@@ -32,6 +33,7 @@ READER = "cvo-edge reader"
 TIMEOUT_S = 5.0
 # To open takes longer than the next frame: an address is looked up, a format is probed.
 _OPENING = 2.0
+_PARTS = 20
 # Giving a device back takes milliseconds.
 _RELEASE_S = 1.0
 
@@ -124,13 +126,16 @@ class Capture:
             raise SourceError(f"{shown(self._device)}: closed")
         self._idle.clear()
         self._calls.put(call)
-        try:
-            answer = self._answers.get(timeout=timeout_s)
-        except Empty:
+        # In parts: while this process is stopped one of them runs out, and not the thread's time.
+        for _ in range(_PARTS):
+            with contextlib.suppress(Empty):
+                answer = self._answers.get(timeout=timeout_s / _PARTS)
+                break
+        else:
             self.close()
             raise SourceError(
                 f"{shown(self._device)}: expected an answer within {timeout_s:g} s, found none"
-            ) from None
+            )
         if isinstance(answer, Exception):
             raise answer
         return answer  # type: ignore[return-value]  # of this very call
@@ -166,11 +171,11 @@ class _Opened:
 
     def __init__(self) -> None:
         self._capture = cv2.VideoCapture()
-        self._arrivals = Arrivals(_now(), 0.0)
+        self._arrivals = Arrivals(clock_s(), 0.0)
 
     def open(self, device: int | str) -> tuple[float, int] | None:
         """Open it -> frames a second and their number, as the container says; None if it is not."""
-        begin = _now()
+        begin = clock_s()
         try:
             if not self._capture.open(device):
                 return None
@@ -200,7 +205,7 @@ class _Opened:
             position_ms=position_ms,
             decode_ms=1e3 * (end - come),
             read_ms=1e3 * (end - begin),
-            queued_ms=1e3 * self._arrivals.queued_s(_now()),
+            queued_ms=1e3 * self._arrivals.queued_s(clock_s()),
         )
 
     def release(self) -> None:
@@ -208,7 +213,7 @@ class _Opened:
         self._capture.release()
 
 
-def _now() -> float:
+def clock_s() -> float:
     """Seconds of a clock that goes on while the machine sleeps, where there is one."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
@@ -224,13 +229,14 @@ class Arrivals:
 
     # A lag that matters, and how far a camera's jitter may have it wrong.
     _LAG_S = 1.0
-    _JITTER, _JITTER_S = 3.0, 0.25
+    _JITTER, _JITTER_S = 1.5, 0.15
     # No queue holds more.
     _MOST_S = 60.0
     # Until so many gaps are known they are taken for those of a camera of 30 a second, or of 60 if
     # it says so; and no frame makes up for more than that.
     _FEW, _FPS, _MOST_FPS, _LATE_S = 8, 30.0, 60.0, 1.0
     _USUAL, _SOME, _SOME_S = 64, 16, 2.0
+    _SLOW, _ALIKE = 4, 1.5
     # No sooner than usual, nearly; and far later.
     _AS_USUAL, _LATE = 0.9, 3.0
     # Even a decoder that is hardly faster than the camera has emptied a queue by then.
@@ -252,14 +258,18 @@ class Arrivals:
         """
         gap, self._last = come - self._last, come
         first, self._first = self._first, False
+        # What it took to open says nothing of a rate.
+        if not first:
+            self._recent.append(gap)
+        last = list(self._recent)[-self._SLOW :]
+        if len(self._gaps) < self._FEW and self._are_slow(last):
+            self._gaps.extend(self._FEW // self._SLOW * last)
+            self._lag_s = self._largest_s = 0.0
         known = len(self._gaps) >= self._FEW
         usual = fmean(self._gaps) if known else self._gap_s
         late_s = self._LATE * usual if known else self._LATE_S
         made_up = self._AS_USUAL * usual
         self._lag_s = min(max(0.0, self._lag_s + gap - made_up), self._MOST_S)
-        # What it took to open says nothing of a rate.
-        if not first:
-            self._recent.append(gap)
         if first or gap > late_s:
             self._since.clear()
             self._spent_s = 0.0
@@ -280,6 +290,14 @@ class Arrivals:
         else:
             self._largest_s = 0.0
         return self._largest_s
+
+    def _are_slow(self, gaps: list[float]) -> bool:
+        """Whether frames come more slowly than was assumed, one like the other: at their own rate.
+
+        Those of a queue come sooner.
+        """
+        slow_s, alike_s = self._ALIKE * self._gap_s, max(gaps, default=0.0) / self._ALIKE
+        return len(gaps) == self._SLOW and slow_s < min(gaps) > alike_s
 
     def _is_empty(self, usual: float) -> bool:
         some = len(self._since) == self._SOME or sum(self._since) > self._SOME_S

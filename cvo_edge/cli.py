@@ -27,7 +27,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import typer
 from typer.main import get_command
 
-from cvo_edge.errors import CvoError, GateError, SinkError, SourceError, UsageError
+from cvo_edge.errors import CvoError, GateError, SinkError, SourceError, UsageError, printable
 
 app = typer.Typer(
     add_completion=False,
@@ -454,9 +454,8 @@ def _leave(code: int) -> NoReturn:
 
 
 def _complain(program: str, message: str, code: int) -> int:
-    """One line on stderr, whatever a path or a key in the message holds."""
-    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
-    _say(f"{program}: {shown}")
+    """One line on stderr."""
+    _say(f"{program}: {printable(message)}")
     return code
 
 

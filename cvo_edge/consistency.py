@@ -35,13 +35,16 @@ def consistent_head(calibration: Calibration) -> Head:
 
 
 def _check_tensors(calibration: Calibration, head: Head) -> None:
-    image = {spec.name: spec.shape for spec in calibration.model.inputs if spec.name == "image"}
-    extra = {name: values.shape for name, values in head.extra_inputs(0).items()}
+    model = calibration.model
+    # The image alone is of bytes, as was checked.
+    image = {spec.name: (spec.dtype, spec.shape) for spec in model.inputs if spec.name == "image"}
+    extra = {name: ("float32", noise.shape) for name, noise in head.extra_inputs(0).items()}
+    outputs = {name: ("float32", shape) for name, shape in head.outputs.items()}
     for kind, needed, specs in (
-        ("inputs", {**image, **extra}, calibration.model.inputs),
-        ("outputs", dict(head.outputs), calibration.model.outputs),
+        ("inputs", image | extra, model.inputs),
+        ("outputs", outputs, model.outputs),
     ):
-        found = {spec.name: spec.shape for spec in specs}
+        found = {spec.name: (spec.dtype, spec.shape) for spec in specs}
         if found != needed:
             raise BundleMismatchError(
                 f"model.{kind}: expected {needed} for method {calibration.method}, found {found}"

@@ -37,6 +37,11 @@ class CvoError(Exception):
         super().__init__(message if len(message) <= _LONGEST else f"{message[: _LONGEST - 3]}...")
 
 
+def printable(text: str) -> str:
+    """Return a text as one line that does nothing to a terminal, whatever a path in it holds."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 class UsageError(CvoError):
     """A parameter, option or call that cannot be served, e.g. a confidence that is not stored."""
 

@@ -63,6 +63,16 @@ def decode_image(content: bytes) -> NDArray[np.uint8] | None:
     return np.asarray(image, np.uint8) if image.dtype == np.uint8 else None
 
 
+def is_image(start: bytes) -> bool:
+    """Whether a file's first 16 bytes are those of an image that ``decode_image`` knows."""
+    if start.startswith(b"P"):
+        return re.match(rb"P[1-6]\s", start) is not None
+    # RIFF is a family: videos are of it, too.
+    if start.startswith(b"RIFF"):
+        return start[8:12] == b"WEBP"
+    return any(start.startswith(begin) for begin, _ in _FORMATS)
+
+
 def image_size(content: bytes) -> tuple[int, int] | None:
     """Height and width in the header of an image file, or None where it has none that is whole."""
     for start, read in _FORMATS:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import preprocess
-from cvo_edge.artifact import Bundle, Calibration, Threshold, read_bundle
+from cvo_edge.artifact import MAX_NUMBER, Bundle, Calibration, Threshold, read_bundle
 from cvo_edge.checks import Look, StreamChecks, image_doubt
 from cvo_edge.consistency import consistent_head
 from cvo_edge.errors import ModelError, UsageError
@@ -45,8 +45,6 @@ Array = NDArray[np.float64]
 _STEEP_PITCH = np.deg2rad(80.0)
 # Numbers that Python looks at in less time than numpy's first call takes.
 _FEW = 64
-# Metres, radians, probabilities, scales: no output is near this in any unit.
-_ABSURD = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,10 +438,10 @@ class Odometer:
 def _sensible(output: NDArray[np.float32]) -> bool:
     """Whether all numbers are there and none is absurd."""
     if output.size > _FEW:
-        return bool(np.abs(output).max() < _ABSURD)
+        return bool(np.abs(output).max() < MAX_NUMBER)
     values = output.ravel().tolist()
     # NaN is in a sum wherever it is, but in a maximum only where it comes first.
-    return max(map(abs, values)) < _ABSURD and not math.isnan(sum(values))
+    return max(map(abs, values)) < MAX_NUMBER and not math.isnan(sum(values))
 
 
 def _as_frame(frame: Frame | NDArray[Any]) -> Frame:

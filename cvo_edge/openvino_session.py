@@ -36,8 +36,8 @@ class OpenvinoSession(Session):
                 "model.provider: expected the package openvino, 2026.4 or newer, found "
                 f'{one_line(error)}; pip install "cvo-edge[openvino]"'
             ) from None
-        # It reads what a model names as external data, from whatever folder the process is in;
-        # onnxruntime refuses such a model.
+        # It reads what a model names as external data, from whatever folder the process is in; a
+        # session of onnxruntime refuses such a model.
         Session(model, 1, expected)
         self.threads = checked_threads(threads)
         settings = {

@@ -47,7 +47,7 @@ _UNDECODABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 # With these nothing is wrong with an entry: it may be read later.
 _PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EACCES)
 # Of what is kept, and of the settings it was made with; another one is another entry.
-_FORM = "3"
+_FORM = "4"
 # Copies of a bundle on one machine.
 _MOST_SEEN = 16
 

@@ -85,5 +85,6 @@ def read_records(path: str | Path) -> Iterator[Record]:
                         f"{path}: expected a record in line {number}, found none: {error}"
                     ) from None
                 yield record
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+    # A ValueError is a name that no file can have.
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None

@@ -219,21 +219,23 @@ class Session:
             options.add_session_config_entry("session.intra_op_thread_affinities", others)
             # Where threads rest while they wait, the system finds the caller a better core.
             self._caller_core = {cores[0]} if spinning else set()
-        # float32 has no such products, and the first question takes milliseconds.
-        if (expected is None or expected.precision != "fp32") and saturates():
-            options.add_session_config_entry("session.x64quantprecision", "1")
         options.log_severity_level = 4
         if keep_in is not None:
             options.optimized_model_filepath = str(keep_in / GRAPH_FILE)
             prefix = "session.optimized_model_external_initializers_"
             options.add_session_config_entry(prefix + "file_name", WEIGHTS_FILE)
             options.add_session_config_entry(prefix + "min_size_in_bytes", str(_SMALL_TENSOR))
-        content = model
         if isinstance(model, Prepared):
-            content = model.graph
+            content, weights = model.graph, str(model.folder)
             options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-            key = "session.model_external_initializers_file_folder_path"
-            options.add_session_config_entry(key, str(model.folder))
+        else:
+            # Else it takes what a model names as external data from the folder the process is in.
+            content, weights = model, os.devnull
+            # Whatever the calibration says of the model. What is prepared has it in its graph.
+            if saturates():
+                options.add_session_config_entry("session.x64quantprecision", "1")
+        key = "session.model_external_initializers_file_folder_path"
+        options.add_session_config_entry(key, weights)
         try:
             # Without the fallback, which says on stdout that it loads the same model once more.
             self.engine = onnxruntime.InferenceSession(

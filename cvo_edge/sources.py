@@ -18,12 +18,14 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from numpy.typing import NDArray
 
-from cvo_edge.capture import READER, TIMEOUT_S, Capture, shown
-from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.capture import READER, TIMEOUT_S, Capture, clock_s, shown
+from cvo_edge.errors import SourceError, UsageError, printable
 from cvo_edge.files import read_regular_file
-from cvo_edge.images import MAX_IMAGE_BYTES, decode_image
+from cvo_edge.images import MAX_IMAGE_BYTES, decode_image, is_image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
+# Videos that begin as an image does.
+_JPEGS_IN_A_ROW = (".mjpg", ".mjpeg")
 
 # How long a stream that has ended waits for a frame that is on its way.
 _PATIENCE_S = 2.0
@@ -83,8 +85,9 @@ def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_
     ----------
     text
         Folder of images (natural order; only ``*.color.*`` where there are any, never
-        ``*.depth.*``), a glob pattern, a video file, a camera index such as ``0``, a device path
-        such as ``/dev/video0``, a named pipe, or the address of a stream such as ``rtsp://...``.
+        ``*.depth.*``, nor hidden files), a glob pattern, a video file, a camera index such as
+        ``0``, a device path such as ``/dev/video0``, a named pipe, or the address of a stream such
+        as ``rtsp://...``.
     fps
         Frames per second to stamp frames with, starting at zero, instead of the source's own.
     timeout_s
@@ -108,10 +111,12 @@ def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_
         raise SourceError(f"{shown(text)}: cannot be looked for: {error.strerror}") from None
     if path.is_dir():
         return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
+    if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
+        raise SourceError(f"{shown(text)}: expected a file's path, found an address of one")
     if names_camera(text):
         return Camera(int(text) if text.isdecimal() else text, fps, timeout_s)
     if path.is_file():
-        if path.suffix.lower() in IMAGE_SUFFIXES:
+        if path.suffix.lower() in IMAGE_SUFFIXES or _is_one_image(path):
             return ImageFiles([path], fps, "")
         return Video(path, fps, timeout_s)
     if glob.has_magic(text):
@@ -205,8 +210,8 @@ class Video:
                 unreadable = 0
         if self.length is not None and seq < self.length:
             raise SourceError(
-                f"{self._path}: expected {self.length} frames, found it ended early: "
-                f"{seq} of {self.length}"
+                f"{self._path}: expected {self.length} frames, as its header says or its duration "
+                f"gives, found it ended early: {seq} of {self.length}"
             )
 
 
@@ -347,7 +352,7 @@ class Camera:
             if self._failures == len(PAUSES_S):
                 raise SourceError(f"{problem}, and again {self._failures} times")
             pause_s = PAUSES_S[self._failures]
-            _LOG.warning("%s; opening it again in %g s", problem, pause_s)
+            _LOG.warning("%s; opening it again in %g s", printable(problem), pause_s)
             self._stopped.wait(pause_s)
             self._failures += 1
         return None
@@ -383,7 +388,7 @@ class Newest:
                     self._frame, ready_at = None, self._ready_at
                 if frame is None:
                     break
-                waited_ms = 1e3 * (perf_counter() - ready_at)
+                waited_ms = 1e3 * (clock_s() - ready_at)
                 yield replace(frame, waited_ms=frame.waited_ms + waited_ms, skipped=skipped)
         finally:
             self._closed = True
@@ -399,7 +404,7 @@ class Newest:
             for frame in self._frames:
                 with self._changed:
                     self._skipped += self._frame is not None
-                    self._frame, self._ready_at = frame, perf_counter()
+                    self._frame, self._ready_at = frame, clock_s()
                     self._changed.notify()
                 if self._closed:
                     return
@@ -456,8 +461,22 @@ def _itself(frame: Frame) -> Frame:
     return frame
 
 
+def _is_one_image(path: Path) -> bool:
+    """Whether a file without an image's ending is one: no video, of which FFmpeg would take it."""
+    if path.suffix.lower() in _JPEGS_IN_A_ROW:
+        return False
+    try:
+        with path.open("rb") as stream:
+            return is_image(stream.read(16))
+    except OSError:
+        return False
+
+
 def _images_in(folder: Path) -> list[Path]:
-    return _colour_images([path for path in folder.iterdir() if path.is_file()])
+    # Hidden ones are not pictures: macOS leaves them beside each file on a card.
+    return _colour_images(
+        [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    )
 
 
 def _colour_images(paths: list[Path]) -> list[Path]:

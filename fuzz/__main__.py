@@ -7,6 +7,7 @@ the end, and into ``table.txt``. Exits with 1 where a trial found something.
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -44,6 +45,10 @@ def main() -> int:
     unknown = sorted(set(named) - set(KINDS))
     if unknown:
         print(f"fuzz: expected {', '.join(KINDS)}, found {', '.join(unknown)}", file=sys.stderr)
+        return 2
+    wrong = [word for word in named.values() if word and not re.fullmatch("[1-9][0-9]{0,8}", word)]
+    if wrong:
+        print(f"fuzz: expected numbers of trials, found {', '.join(wrong)}", file=sys.stderr)
         return 2
     found = 0
     for name in named or KINDS:

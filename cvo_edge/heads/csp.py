@@ -25,7 +25,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import Calibration, Threshold
+from cvo_edge.artifact import Calibration, Number, Threshold
 from cvo_edge.conformal import JointScale, RankScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads.cqr import infinite_where_null
@@ -33,7 +33,7 @@ from cvo_edge.pose import ConformalSet, Scope
 
 Array = NDArray[np.float64]
 _SIX = np.arange(6)
-Edges = Annotated[tuple[float, ...], Meta(min_length=3, max_length=513)]
+Edges = Annotated[tuple[Number, ...], Meta(min_length=3, max_length=513)]
 
 
 class Score(StrEnum):

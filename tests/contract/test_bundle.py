@@ -95,13 +95,19 @@ REFUSED = [
     (("pose", "rotation"), "quaternion", "pose.rotation"),
     (("pose", "reference_q_xyzw"), None, "reference_q_xyzw"),
     (("pose", "reference_q_xyzw"), [0, 0, 0, 2], "norm 1"),
-    (("pose", "limits", "lowest"), [9e9] * 6, "lowest < highest"),
+    (("pose", "reference_q_xyzw"), [1e308] * 4, "reference_q_xyzw"),
+    (("pose", "limits", "lowest"), [9e8] * 6, "lowest < highest"),
+    (("pose", "limits", "highest", 2), 1e9, "pose.limits.highest"),
+    (("pose", "standard_deviation", 0), 1e9, "standard_deviation"),
     (("thresholds",), [], "thresholds"),
     (("thresholds", 0, "confidence"), 1.0, "confidence"),
     (("thresholds", 4), ..., "found none for 0.9"),
     (("thresholds", 0, "q_hat"), [1, 2, 3], "q_hat"),
     (("thresholds", 0, "q_hat", 0), "1", "q_hat"),
-    (("thresholds", 0, "q_hat", 0), 1e9, "growth with the confidence"),
+    (("thresholds", 0, "q_hat", 0), 9e8, "growth with the confidence"),
+    (("thresholds", 0, "q_hat", 0), -1.7e308, "q_hat"),
+    (("thresholds", 0, "q_hat", 0), 10**19, "q_hat"),
+    (("selftest", "outputs", "pose", 0), 1e9, "selftest.outputs"),
     (("thresholds", 0, "q_hat", 0), None, "growth with the confidence"),
     (("calibration", "n"), 0, "calibration.n"),
     (("calibration", "n"), -5, "calibration.n"),
@@ -125,6 +131,7 @@ def test_a_wrong_value_names_the_key(document, path, value, rule):
 
 METHOD_PARAMETERS = [
     ("half_width_floor", [1, 1, 1, 1, 1, 0]),
+    ("half_width_floor", [1, 1, 1, 1, 1, 1e308]),
     ("latent", "median"),
     ("latent_size", 0),
     ("latent_size", 10**12),
@@ -140,12 +147,19 @@ def test_wrong_method_parameters_are_refused_at_load(copied_bundle, document, ke
         Odometer.load(copied_bundle)
 
 
-@pytest.mark.parametrize("change", ["latent", "dropped output"])
+@pytest.mark.parametrize("change", ["latent", "noise of bytes", "output of bytes", "no output"])
 def test_tensors_that_the_method_does_not_work_with_are_refused_at_load(
     copied_bundle, document, change
 ):
     if change == "latent":
         wrong = replaced(document, ("method_parameters", "latent"), "sample")
+    elif change == "noise of bytes":
+        wrong = replaced(document, ("method_parameters", "latent"), "sample")
+        size = document["method_parameters"]["latent_size"]
+        noise = {"name": "latent_noise", "dtype": "uint8", "shape": [1, size]}
+        wrong["model"]["inputs"].append(noise)
+    elif change == "output of bytes":
+        wrong = replaced(document, ("model", "outputs", 0, "dtype"), "uint8")
     else:
         wrong = replaced(document, ("model", "outputs"), document["model"]["outputs"][:2])
         wrong = replaced(wrong, ("selftest", "outputs", "upper"), ...)

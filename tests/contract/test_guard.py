@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from cvo_edge import BundleMismatchError, GateError, ModelError
-from cvo_edge.artifact import MODEL_FILE
+from cvo_edge import BundleMismatchError, GateError, ModelCache, ModelError, Odometer
+from cvo_edge.artifact import MODEL_FILE, read_calibration
 from cvo_edge.guard import verify_bundle
 
 onnx = pytest.importorskip("onnx")
@@ -125,6 +125,31 @@ def test_whatever_the_model_does_verify_ends_and_says_so(with_model, bundle, mak
         verify_bundle(folder, threads=1, timeout_s=3.0 if make is endless else 60.0)
     assert "\n" not in str(caught.value)
     assert time.monotonic() - begin < 60.0
+
+
+@pytest.mark.parametrize("provider", ["onnxruntime", "openvino"])
+def test_a_model_that_reaches_for_files_is_refused(
+    with_model, copied_bundle, rewrite, bundle, tmp_path, monkeypatch, provider
+):
+    """Whoever writes a folder that the program is started in would change what is signed."""
+    if provider == "openvino":
+        pytest.importorskip("openvino")
+    model = onnx.load_from_string(bundle.model_bytes)
+    weights = max(model.graph.initializer, key=lambda each: len(each.raw_data))
+    for folder in (tmp_path, copied_bundle):
+        (folder / "weights.bin").write_bytes(weights.raw_data)
+    onnx.external_data_helper.set_external_data(weights, "weights.bin")
+    weights.ClearField("raw_data")
+    folder = with_model(model.SerializeToString())
+    calibration = read_calibration(folder)
+    spec = msgspec.structs.replace(calibration.model, provider=provider)
+    rewrite(msgspec.structs.replace(calibration, model=spec))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelError, match="refused by onnxruntime"):
+        verify_bundle(folder, threads=1)
+    for cache in (None, ModelCache(tmp_path / "cache")):
+        with pytest.raises(ModelError, match="refused by onnxruntime"):
+            Odometer.load(folder, cache=cache)
 
 
 def test_the_good_one_passes_and_names_itself(bundle_dir, bundle):

@@ -264,6 +264,44 @@ def test_what_lay_in_a_queue_while_the_process_was_stopped_has_no_interval(
     assert ages[-1][0] < 1.0
 
 
+def test_time_in_which_the_process_was_stopped_is_no_time_waited(bundle_dir, tmp_path):
+    path, records = tmp_path / "clip.avi", tmp_path / "records.jsonl"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (1280, 960))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no video")
+    generator = np.random.default_rng(0)
+    for _ in range(150):
+        small = generator.integers(0, 255, (120, 160, 3)).astype(np.uint8)
+        writer.write(cv2.resize(small, (1280, 960)))
+    writer.release()
+    arguments = ["run", bundle_dir, path, "-o", records, "--timeout", "0.5", "--quiet"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", RUN, *map(str, arguments)], stderr=subprocess.PIPE, text=True
+    )
+    for number in range(3):
+        deadline = time.monotonic() + 60.0
+        while time.monotonic() < deadline and process.poll() is None:
+            if records.exists() and records.read_bytes().count(b"\n") > 10 * number:
+                break
+            time.sleep(0.01)
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(0.8)
+        process.send_signal(signal.SIGCONT)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    assert len(list(read_records(records))) == 150
+
+
+def test_what_an_address_holds_cannot_forge_a_line(caplog, hasty):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"http://127.0.0.1:{free.getsockname()[1]}/\nfoo\x1b[31m"
+    with pytest.raises(SourceError):
+        open_source(address, timeout_s=1.0)
+    assert caplog.records
+    assert all(record.getMessage().isprintable() for record in caplog.records)
+
+
 @pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_time_to_wait_must_be_one(timeout_s, tmp_path):
     with pytest.raises(UsageError, match="timeout"):
@@ -342,7 +380,7 @@ def test_bench_connects_once(network_camera, bundle_dir):
         # it took long to open: what came meanwhile may lie there
         ([4.0] + [0.034] * 20, [1] * 16 + [0] * 5),
         # it is a camera of one frame every two seconds
-        ([2.0] * 20, [1] * 10 + [0] * 10),
+        ([2.0] * 20, [1] * 4 + [0] * 16),
     ],
 )
 def test_what_comes_sooner_than_usual_after_a_pause_is_old(gaps, queued):
@@ -406,6 +444,16 @@ def test_a_camera_that_turns_slow_or_fast_is_believed_again(jitter):
             said.append(arrivals.queued_s(now))
         assert sum(age > 0.0 for age in said) < 20
         assert not any(said[20:])
+
+
+@pytest.mark.parametrize("period", [0.2, 0.5, 1.0, 2.0, 5.0])
+def test_a_slow_camera_is_believed_after_a_few_frames(period):
+    for seed in range(20):
+        arrivals, now, said = Arrivals(0.0, 30.0), 0.1, []
+        for factor in 1.0 + 0.02 * np.random.default_rng(seed).standard_normal(200):
+            said.append(arrivals.queued_s(now))
+            now += factor * period
+        assert sum(age > 0.0 for age in said) < 8
 
 
 @pytest.mark.parametrize("address", ["http://u:secret@h/x", "rtsp://u:se@secret@h:1/x@y"])

@@ -28,6 +28,7 @@ from cvo_edge.prepared import (
     file_digests,
 )
 from cvo_edge.selftest import check_selftest
+from cvo_edge.session import Session
 from cvo_edge.sources import open_source
 
 CVO_EDGE = [sys.executable, "-c", "from cvo_edge.cli import main; main()"]
@@ -43,7 +44,7 @@ def entry_folder(cache: ModelCache) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("method", ["cjp", "cqr", "csp", "mcqr"])
+@pytest.mark.parametrize("method", ["cjp", "cqr", "csp", "mcqr", "cjp-int8"])
 def test_a_prepared_model_computes_the_very_same(method, bundle_dir, clip_dir, cache):
     folder = bundle_dir.with_name(f"synthetic-room-{method}")
     with (
@@ -58,6 +59,23 @@ def test_a_prepared_model_computes_the_very_same(method, bundle_dir, clip_dir, c
                 for name, values in expected.outputs.items():
                     assert np.array_equal(values, other.outputs[name])
     assert isinstance(load_bundle(folder, cache), PreparedBundle)
+
+
+def test_what_is_prepared_is_the_same_whatever_a_calibration_says_of_it(
+    artifacts_dir, tmp_path, monkeypatch
+):
+    """Of one model there is one entry: a bundle that calls it float32 must not spoil it."""
+    bundle = read_bundle(artifacts_dir / "synthetic-room-cjp-int8")
+    # As on a processor on which it makes a difference.
+    monkeypatch.setattr("cvo_edge.session.saturates", lambda: True)
+    graphs = []
+    for precision in ("int8", "fp32"):
+        folder = tmp_path / precision
+        folder.mkdir()
+        model = msgspec.structs.replace(bundle.calibration.model, precision=precision)
+        Session(bundle.model_bytes, 1, model, keep_in=folder)
+        graphs.append((folder / GRAPH_FILE).read_bytes())
+    assert graphs[0] == graphs[1]
 
 
 @pytest.mark.parametrize("file", [GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE])

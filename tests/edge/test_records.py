@@ -72,6 +72,7 @@ def test_a_whole_line_that_is_no_record_is_named(recorded, tmp_path, line):
         next(records)
 
 
-def test_a_file_that_is_not_there_is_an_error_of_its_own(tmp_path):
-    with pytest.raises(SourceError, match="No such file"):
-        list(read_records(tmp_path / "none.jsonl"))
+@pytest.mark.parametrize(("name", "why"), [("none.jsonl", "No such file"), ("a\0b", "null byte")])
+def test_a_file_that_is_not_there_is_an_error_of_its_own(tmp_path, name, why):
+    with pytest.raises(SourceError, match=why):
+        list(read_records(tmp_path / name))

@@ -111,6 +111,33 @@ def test_fps_must_be_of_a_camera(tmp_path, fps):
         open_source(str(tmp_path), fps)
 
 
+def test_hidden_files_are_no_frames(tmp_path):
+    write(tmp_path / "0.png")
+    # As macOS leaves one beside each file on a card.
+    (tmp_path / "._0.png").write_bytes(b"\0\5\x16\7")
+    assert names(open_source(str(tmp_path))) == ["0.png"]
+
+
+@pytest.mark.parametrize("name", ["a.jpe", "a.jfif", "a", "a.pbm", "a.mp4"])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".ppm"])
+def test_one_image_is_an_image_whatever_its_name(tmp_path, name, suffix):
+    path = tmp_path / name
+    content = cv2.imencode(suffix, picture(7))[1].tobytes()
+    path.write_bytes(content)
+    (whole,) = open_source(str(path))
+    assert whole.image.shape == (48, 64, 3)
+    path.write_bytes(content[:-3])
+    (cut,) = open_source(str(path))
+    assert cut.image is None
+
+
+@pytest.mark.parametrize("scheme", ["file", "FILE", "crypto+file", "cache:file", "subfile,,"])
+def test_a_file_s_address_is_no_camera(tmp_path, scheme):
+    write(tmp_path / "0.png")
+    with pytest.raises(SourceError, match="expected a file's path"):
+        open_source(f"{scheme}://{tmp_path}/0.png")
+
+
 @pytest.fixture
 def video(tmp_path):
     path = tmp_path / "clip.avi"

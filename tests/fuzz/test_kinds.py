@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fuzz import bundles, kills, media, sensors, simulation
-from fuzz.__main__ import KINDS
+from fuzz.__main__ import KINDS, main
 from fuzz.mutate import changed_bytes, changed_document, with_digest
 from fuzz.trials import Ended
 
@@ -50,6 +50,12 @@ def test_nothing_is_found(kind):
     assert tally.outcomes[SEEN.get(kind, "")] > 0 or kind not in SEEN
 
 
+@pytest.mark.parametrize("word", ["models=0", "kills=-5", "images=x", "nothing"])
+def test_what_tries_nothing_is_refused(monkeypatch, word):
+    monkeypatch.setattr("sys.argv", ["fuzz", word])
+    assert main() == 2
+
+
 def test_what_would_be_a_finding_is_one(monkeypatch, artifacts_dir):
     # A reader without digests takes what it is given.
     monkeypatch.setattr(bundles, "read_bundle", lambda _: None)
@@ -92,6 +98,10 @@ def test_what_is_changed_is_another_and_its_digest_fits(bundle_dir):
     assert with_digest(content) == content
     for seed in range(50):
         assert changed_bytes(content, np.random.default_rng(seed)) != content
+    model = (bundle_dir / "model.onnx").read_bytes()
+    same = bundles.onnx.load_from_string(model).SerializeToString()
+    for seed in range(40):
+        assert bundles._changed_graph(model, np.random.default_rng(seed)) != same
     document = {"a": [1, 2.5, "x"], "b": {"c": None, "digits": 12}}
     changed = {changed_document(document, np.random.default_rng(seed)) for seed in range(50)}
     assert len(changed) > 40
