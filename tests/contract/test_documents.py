@@ -1,5 +1,6 @@
 """Figures in the documents are those that the programs of ``bench`` wrote."""
 
+import json
 import re
 import signal
 import subprocess
@@ -7,6 +8,8 @@ import sys
 from pathlib import Path
 
 from cvo_edge import Reason, errors
+from fuzz.__main__ import KINDS, RESULTS
+from fuzz.__main__ import table as fuzz_table
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -50,3 +53,12 @@ def test_every_reason_and_every_exit_code_is_explained() -> None:
     codes = {str(error.exit_code) for error in errors.CvoError.__subclasses__()}
     assert {row for row in rows if row.isdigit()} == codes | {"0", "1"}
     assert f"{128 + signal.SIGINT}, {128 + signal.SIGTERM}" in rows
+
+
+def test_what_was_tried_is_told_as_counted() -> None:
+    assert fuzz_table() in (ROOT / "docs" / "faults.md").read_text("utf-8")
+    assert fuzz_table() == (RESULTS / "table.txt").read_text("utf-8")
+    found = {kind: json.loads((RESULTS / f"{kind}.json").read_text("utf-8")) for kind in KINDS}
+    for kind, (what, count, _) in KINDS.items():
+        assert (found[kind]["what"], found[kind]["findings"]) == (what, []), kind
+        assert found[kind]["trials"] >= count, kind
