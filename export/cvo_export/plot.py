@@ -12,6 +12,7 @@ from cvo_edge.artifact import Calibration
 from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import Chart, PoseInterval, Scope
+from cvo_edge.sources import Frame
 from cvo_export.datasets import PoseDataset
 from cvo_export.evaluate import Subset, subset_indices
 
@@ -131,7 +132,10 @@ def _step(odometer: Odometer, dataset: PoseDataset, index: int) -> PoseInterval:
         image: Any = dataset.read_image(index)
     except SourceError:
         image = None
-    return odometer.step(image, source=dataset.frame_names[index])
+    # A stream of its own: drawn frames need not follow one another, and `evaluate` compares none.
+    frame = Frame(image, None, dataset.frame_names[index], 0.0)
+    (estimate,) = odometer.stream([frame])
+    return estimate
 
 
 def _truth(chart: Chart, estimates: list[PoseInterval], poses: Array) -> Array:

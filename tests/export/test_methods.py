@@ -1,6 +1,7 @@
 """CQR, CSP and MCQR from training to bundle: what holds for every method, and what for each."""
 
 import csv
+import dataclasses
 import io
 import json
 
@@ -23,7 +24,7 @@ from cvo_export.heads.cqr import CqrConfig
 from cvo_export.heads.csp import Classes, CspConfig, CspLearner, best_temperatures, set_score
 from cvo_export.heads.mcqr import McqrConfig
 from cvo_export.heads.point import PointNetwork
-from cvo_export.plot import plot
+from cvo_export.plot import plot, track
 from cvo_export.publish import publish
 from cvo_export.run import load_run
 from cvo_export.train import train
@@ -167,6 +168,16 @@ def test_a_picture_is_drawn(runs, method, tmp_path):
         plot(bundle, run.dataset, tmp_path / "bands.xyz")
     with pytest.raises(UsageError, match="sequence: expected one of"):
         plot(bundle, run.dataset, tmp_path / "other.png", sequence="no such")
+
+
+def test_a_picture_shows_the_sets_that_are_evaluated(runs):
+    _, run, bundle = runs("cqr")
+    image = run.dataset.read_image(0)
+    repeating = dataclasses.replace(run.dataset, read_image=lambda _: image)
+    drawn = track(bundle, repeating).estimates
+    frames = evaluate(bundle, repeating, "test")["frames"]
+    assert frames["total"] == frames["bounded"] == len(drawn)
+    assert all(np.isfinite(estimate.lower).all() for estimate in drawn)
 
 
 def options(**changes):
