@@ -21,18 +21,18 @@ from time import perf_counter
 import numpy as np
 from networks import pose_alone
 
-from cvo_edge import preprocess
-from cvo_edge.artifact import read_bundle
+from cvo_edge.bundle.reading import read_bundle
+from cvo_edge.engine.session import Session
+from cvo_edge.input import preprocess
+from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
-from cvo_edge.profile import environment
-from cvo_edge.session import Session
-from cvo_edge.sources import open_source
+from cvo_edge.programs.measure import environment
 
 LOAD = """
 import sys
 from pathlib import Path
-from cvo_edge.profile import memory_mib
-from cvo_edge.session import Session
+from cvo_edge.programs.measure import memory_mib
+from cvo_edge.engine.session import Session
 content = Path(sys.argv[1]).read_bytes()
 before = memory_mib()
 session = Session(content)

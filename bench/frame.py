@@ -32,13 +32,13 @@ from networks import (
 )
 from rounds import Array, figures, interleaved, ratio, write_report
 
-from cvo_edge import preprocess
-from cvo_edge.artifact import Bundle, read_bundle
-from cvo_edge.images import decode_image
+from cvo_edge.bundle.reading import Bundle, read_bundle
+from cvo_edge.engine.session import Session
+from cvo_edge.input import preprocess
+from cvo_edge.input.decoding import decode_image
 from cvo_edge.odometer import Odometer
-from cvo_edge.pose import Scope
-from cvo_edge.session import Session
-from cvo_edge.sinks import Sink
+from cvo_edge.output.sinks import Sink
+from cvo_edge.sets import Scope
 
 THREADS, ROUNDS, WARM_UP, BLOCKS = 2, 150, 20, 3
 PAIRS = (("record", "raw"), ("step", "pose_alone"), ("step", "raw"))

@@ -25,9 +25,9 @@ from networks import BACKBONES, WORK, images, whole_bundle
 from numpy.typing import NDArray
 from rounds import Array, figures, interleaved, just_written, ratio, write_report
 
-from cvo_edge import preprocess
+from cvo_edge.input import preprocess
 from cvo_edge.odometer import Odometer
-from cvo_export.run import PoseGraph, load_run
+from cvo_export.training.run import PoseGraph, load_run
 
 THREADS, ROUNDS, WARM_UP = 2, 40, 5
 # OpenMP's threads look for work for a fifth of a second after a call.

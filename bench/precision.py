@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from cvo_edge.artifact import Precision, read_calibration
+from cvo_edge.bundle.format import Precision
+from cvo_edge.bundle.reading import read_calibration
 from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.publish import publish
-from cvo_export.run import load_run
+from cvo_export.training.run import load_run
 
 CONFIDENCE = 0.9
 PRECISIONS: tuple[Precision, ...] = ("fp32", "int8")

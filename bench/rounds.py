@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.profile import environment
+from cvo_edge.programs.measure import environment
 
 RESULTS = Path(__file__).parent / "results" / "speed"
 Array = NDArray[np.float64]

@@ -19,15 +19,15 @@ from frame import measured
 from networks import ROOM, WORK, demonstration, images
 from rounds import figures, write_report
 
-from cvo_edge.artifact import CONFIDENCES as LEVELS
-from cvo_edge.artifact import encode_calibration, read_bundle, read_calibration
+from cvo_edge.bundle.format import CONFIDENCES as LEVELS
+from cvo_edge.bundle.reading import encode_calibration, read_bundle, read_calibration
 from cvo_edge.odometer import Odometer
-from cvo_edge.pose import Scope
-from cvo_export.configure import configure
-from cvo_export.directional import Choice, RegionNetwork
-from cvo_export.heads import mcqr
+from cvo_edge.sets import Scope
+from cvo_export.networks.directional import Choice, RegionNetwork
+from cvo_export.networks.heads import mcqr
 from cvo_export.publish import publish
-from cvo_export.train import train
+from cvo_export.training.configure import configure
+from cvo_export.training.loop import train
 
 ROUNDS = 99
 SIZES = ("128x96", "256x192", "384x288", "512x384")

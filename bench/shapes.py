@@ -25,16 +25,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cvo_edge.conformal import conformal_quantile
-from cvo_export.directional import (
+from cvo_export.bundles.volume import union_log_volume
+from cvo_export.evaluate import coverage_band
+from cvo_export.networks.directional import (
     Choice,
     RegionConfig,
     RegionNetwork,
     best_choice,
     scaled_distances,
 )
-from cvo_export.evaluate import coverage_band
-from cvo_export.losses import pinball_loss
-from cvo_export.volume import union_log_volume
+from cvo_export.networks.losses import pinball_loss
 
 mpl.use("agg")
 from matplotlib import pyplot as plt

@@ -23,14 +23,15 @@ import numpy as np
 from networks import ARTIFACTS, demonstration
 from rounds import write_report
 
-from cvo_edge.modes import Mode
+from cvo_edge.estimate import PoseInterval
+from cvo_edge.ground_truth import open_ground_truth
+from cvo_edge.input.frame import Frame
+from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
-from cvo_edge.pose import PoseInterval
-from cvo_edge.profile import memory_mib
-from cvo_edge.run import RunSummary, run
-from cvo_edge.sinks import Sink
-from cvo_edge.sources import Frame, open_source
-from cvo_edge.trajectory import open_ground_truth
+from cvo_edge.output.sinks import Sink
+from cvo_edge.programs.measure import memory_mib
+from cvo_edge.programs.run import RunSummary, run
+from cvo_edge.scheduling import Mode
 
 METHOD, FRAMES, READINGS = "cjp", 1_000_000, 100
 CLIP = ARTIFACTS / "synthetic-room-clip"

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from networks import METHODS, demonstration, frames, images
 
-from cvo_edge import preprocess
-from cvo_edge.images import decode_image
+from cvo_edge.input import preprocess
+from cvo_edge.input.decoding import decode_image
 from cvo_edge.odometer import Odometer
 
 THREADS, ROUNDS, WARM_UP = 2, 300, 50

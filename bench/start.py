@@ -58,7 +58,7 @@ session = onnxruntime.InferenceSession(sys.argv[1] + "/model.onnx")
 image = cv2.cvtColor(cv2.resize(cv2.imread(sys.argv[2]), (224, 224)), cv2.COLOR_BGR2RGB)
 print(session.run(None, {"image": image[numpy.newaxis]}))
 """
-RUN = "from cvo_edge.cli import main; main()"
+RUN = "from cvo_edge.__main__ import main; main()"
 
 
 def loaded(backbone: str) -> dict[str, Any]:

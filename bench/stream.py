@@ -28,11 +28,12 @@ import onnxruntime
 from networks import BACKBONES, WORK, frames, images, whole_bundle
 from rounds import figures, in_turn, interleaved, ratio, write_report
 
-from cvo_edge.artifact import read_bundle
-from cvo_edge.modes import Mode
+from cvo_edge.bundle.reading import read_bundle
+from cvo_edge.input.frame import Frame
+from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
-from cvo_edge.sinks import Sink
-from cvo_edge.sources import Frame, open_source
+from cvo_edge.output.sinks import Sink
+from cvo_edge.scheduling import Mode
 
 METHOD, THREADS = "cjp", 2
 ROUNDS, WARM_UP = 15, 2

@@ -28,18 +28,18 @@ from onnx import compose
 from rounds import Array, figures, interleaved, just_written, ratio, write_report
 from torch import Tensor, nn
 
-from cvo_edge import preprocess
+from cvo_edge.engine.session import Session
+from cvo_edge.input import preprocess
 from cvo_edge.odometer import Odometer
-from cvo_edge.session import Session
-from cvo_export.backbone import Backbone
-from cvo_export.baselines.base import IntervalHead, TrunkConfig, trunk
-from cvo_export.baselines.ensemble import MEMBERS, EnsembleConfig, EnsembleNetwork
-from cvo_export.baselines.gaussian import GaussianConfig, GaussianNetwork
-from cvo_export.baselines.mc_dropout import PASSES, McDropoutConfig, McDropoutNetwork
-from cvo_export.heads.base import DOF, Setting
-from cvo_export.run import PoseGraph, Run, load_run
-from cvo_export.target import PoseDecoder
-from cvo_export.to_onnx import export_onnx
+from cvo_export.graph.to_onnx import export_onnx
+from cvo_export.networks.backbone import Backbone
+from cvo_export.networks.baselines.base import IntervalHead, TrunkConfig, trunk
+from cvo_export.networks.baselines.ensemble import MEMBERS, EnsembleConfig, EnsembleNetwork
+from cvo_export.networks.baselines.gaussian import GaussianConfig, GaussianNetwork
+from cvo_export.networks.baselines.mc_dropout import PASSES, McDropoutConfig, McDropoutNetwork
+from cvo_export.networks.heads.base import DOF, Setting
+from cvo_export.networks.standardised import PoseDecoder
+from cvo_export.training.run import PoseGraph, Run, load_run
 
 THREADS, ROUNDS, WARM_UP = 2, 30, 3
 # Threads of the naive forms look for work for milliseconds after a call.

@@ -35,11 +35,12 @@ from boards.compare import (
 )
 from boards.frames import DATASET, write_test_frames
 from boards.machine import BOARDS, FOLDER, ROOT, Board, SetUpError, emulator_version, set_up
-from cvo_edge.artifact import CALIBRATION_FILE, Calibration, read_calibration
+from cvo_edge.bundle.format import CALIBRATION_FILE, Calibration
+from cvo_edge.bundle.reading import read_calibration
+from cvo_edge.cores import allowed_cores
 from cvo_edge.errors import CvoError
+from cvo_edge.ground_truth import MATRIX_SUFFIX, read_pose_matrix
 from cvo_edge.pose import Chart
-from cvo_edge.session import allowed_cores
-from cvo_edge.trajectory import MATRIX_SUFFIX, read_pose_matrix
 
 CONFIDENCE = 0.9
 
@@ -56,7 +57,7 @@ LEAST_SATURATION_M = 1e-3
 # Their sets move by whole classes.
 STEPWISE = ("csp",)
 
-_RUNTIME = ("-c", "from cvo_edge.cli import main; main()")
+_RUNTIME = ("-c", "from cvo_edge.__main__ import main; main()")
 
 
 def main() -> int:

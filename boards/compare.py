@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import geometry
-from cvo_edge.pose import Bands, Chart, ConformalSet
+from cvo_edge.pose import Chart
+from cvo_edge.sets import Bands, ConformalSet
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import SplitSpec
+from cvo_edge.bundle.format import SplitSpec
+from cvo_export.data.splits import same_split
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.datasets.seven_scenes import write_sequence
-from cvo_export.splits import same_split
 
 # What calibration_artifacts/README.md trains and calibrates on.
 DATASET = "synthetic:room,flights=100"

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import onnxruntime
 
-from cvo_edge import preprocess
-from cvo_edge.artifact import read_bundle
+from cvo_edge.bundle.reading import read_bundle
 from cvo_edge.heads import HEADS
-from cvo_edge.sources import open_source
+from cvo_edge.input import preprocess
+from cvo_edge.input.sources import open_source
 
 
 def poses(bundle_dir: Path, folder: str, count: int, *, precise: bool) -> list[list[float]]:

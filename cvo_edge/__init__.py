@@ -13,7 +13,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cvo_edge.artifact import Bundle, Calibration, read_bundle
+    from cvo_edge.bundle.format import Calibration
+    from cvo_edge.bundle.reading import Bundle, read_bundle
+    from cvo_edge.engine.model_cache import ModelCache
     from cvo_edge.errors import (
         BundleMismatchError,
         CalibrationFileError,
@@ -24,11 +26,13 @@ if TYPE_CHECKING:
         SourceError,
         UsageError,
     )
+    from cvo_edge.estimate import PoseInterval, Reason, Status
+    from cvo_edge.input.frame import Frame
+    from cvo_edge.input.sources import open_source
     from cvo_edge.odometer import Odometer
-    from cvo_edge.pose import Chart, ConformalSet, Ellipsoids, Pose, PoseInterval, Reason, Status
-    from cvo_edge.prepared import ModelCache
-    from cvo_edge.records import Record, read_records
-    from cvo_edge.sources import Frame, open_source
+    from cvo_edge.output.records import Record, read_records
+    from cvo_edge.pose import Chart, Pose
+    from cvo_edge.sets import ConformalSet, Ellipsoids
 
 __version__ = "0.1.0"
 
@@ -60,30 +64,30 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Bundle": "artifact",
+    "Bundle": "bundle.reading",
     "BundleMismatchError": "errors",
-    "Calibration": "artifact",
+    "Calibration": "bundle.format",
     "CalibrationFileError": "errors",
     "Chart": "pose",
-    "ConformalSet": "pose",
+    "ConformalSet": "sets",
     "CvoError": "errors",
-    "Ellipsoids": "pose",
-    "Frame": "sources",
+    "Ellipsoids": "sets",
+    "Frame": "input.frame",
     "GateError": "errors",
-    "ModelCache": "prepared",
+    "ModelCache": "engine.model_cache",
     "ModelError": "errors",
     "Odometer": "odometer",
     "Pose": "pose",
-    "PoseInterval": "pose",
-    "Reason": "pose",
-    "Record": "records",
+    "PoseInterval": "estimate",
+    "Reason": "estimate",
+    "Record": "output.records",
     "SinkError": "errors",
     "SourceError": "errors",
-    "Status": "pose",
+    "Status": "estimate",
     "UsageError": "errors",
-    "open_source": "sources",
-    "read_bundle": "artifact",
-    "read_records": "records",
+    "open_source": "input.sources",
+    "read_bundle": "bundle.reading",
+    "read_records": "output.records",
 }
 
 

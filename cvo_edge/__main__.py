@@ -1,4 +1,4 @@
-"""The program ``cvo-edge``, which an interrupt ends quietly also while it is being imported."""
+"""The program ``cvo-edge``; an interrupt during start-up ends it without a traceback."""
 
 from __future__ import annotations
 
@@ -9,10 +9,18 @@ from typing import NoReturn
 def main() -> NoReturn:
     """Entry point of ``cvo-edge``."""
     # Unless whoever started it had it ignored.
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if interruptible:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from cvo_edge.cli import main as run
+    from cvo_edge import process
 
+    process.prepare_environment()
+    from cvo_edge.programs.cli import main as run
+
+    if interruptible:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    process.keep_libraries_off_stderr()
+    process.end_within_a_second()
     run()
 
 

@@ -1,13 +1,14 @@
-"""Files from outside: regular ones, of a bounded size, or an error."""
+"""Files: reading those from outside within bounds, writing whole or not at all, own folders."""
 
 from __future__ import annotations
 
 import io
 import os
 import stat
+import sys
 from pathlib import Path
 
-from cvo_edge.errors import CvoError
+from cvo_edge.errors import CvoError, SinkError, UsageError
 
 
 def regular_file(
@@ -55,3 +56,41 @@ def read_regular_file(
     if len(content) > limit:
         raise error(f"{path}: expected at most {limit} bytes, found more")
     return content
+
+
+def write_text(target: str, text: str) -> None:
+    """Write text to a file, or to standard output for ``-``; raises SinkError."""
+    if target == "-":
+        sys.stdout.write(text)
+        return
+    try:
+        Path(target).write_text(text, "utf-8")
+    except OSError as error:
+        raise SinkError(f"{target}: cannot be written: {error.strerror}") from None
+
+
+def own_folder(variable: str, base_variable: str, base: str) -> Path:
+    """Return the folder that a variable names, else ``cvo-edge`` in the user's own of that kind.
+
+    Parameters
+    ----------
+    variable
+        Ours, e.g. ``CVO_EDGE_CACHE``.
+    base_variable, base
+        That of the XDG specification, e.g. ``XDG_CACHE_HOME``, and what it stands for if not set.
+
+    Raises UsageError for a relative path in ``variable``: it would mean another folder everywhere.
+    """
+    named = os.environ.get(variable)
+    if named:
+        if not Path(named).is_absolute():
+            raise UsageError(f"{variable}: expected an absolute path, found {named!r}")
+        return Path(named)
+    given = os.environ.get(base_variable, "")
+    if Path(given).is_absolute():
+        return Path(given) / "cvo-edge"
+    try:
+        return Path(base).expanduser() / "cvo-edge"
+    except RuntimeError:
+        # A user without a home: a folder that cannot be made.
+        return Path(os.devnull) / "cvo-edge"

@@ -18,27 +18,20 @@ from typing import Any, NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge import preprocess
-from cvo_edge.artifact import MAX_NUMBER, Bundle, Calibration, Threshold, read_bundle
-from cvo_edge.checks import Look, StreamChecks, image_doubt
-from cvo_edge.consistency import consistent_head
+from cvo_edge.bundle.format import MAX_NUMBER, Calibration, Threshold
+from cvo_edge.bundle.reading import Bundle, read_bundle
+from cvo_edge.engine.loading import PreparedBundle, load_bundle, open_session
+from cvo_edge.engine.model_cache import ModelCache
+from cvo_edge.engine.session import Session
 from cvo_edge.errors import ModelError, UsageError
-from cvo_edge.loading import PreparedBundle, load_bundle
-from cvo_edge.modes import Mode, checked_mode, in_order, plan
-from cvo_edge.pose import (
-    Chart,
-    ConformalSet,
-    Pose,
-    PoseInterval,
-    Reason,
-    Scope,
-    Status,
-    unbounded_set,
-)
-from cvo_edge.prepared import ModelCache
-from cvo_edge.providers import open_session
-from cvo_edge.session import Session
-from cvo_edge.sources import Frame, Newest, Played, Source
+from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.heads.checked import consistent_head
+from cvo_edge.input import preprocess
+from cvo_edge.input.frame import Frame, Source
+from cvo_edge.input.frame_checks import Look, StreamChecks, image_doubt
+from cvo_edge.pose import Chart, Pose
+from cvo_edge.scheduling import Mode, Newest, Played, checked_mode, in_order, plan
+from cvo_edge.sets import ConformalSet, Scope, unbounded_set
 
 Array = NDArray[np.float64]
 
@@ -98,7 +91,7 @@ class Odometer:
         Cores to use; all allowed ones by default.
     mode
         What a stream is to be good at: ``latency``, ``throughput`` or ``live``, see
-        ``cvo_edge.modes``.
+        ``cvo_edge.scheduling``.
     confidence
         One of the confidences stored in the bundle.
     scope
@@ -176,7 +169,7 @@ class Odometer:
         folder = Path(bundle)
         trust = None
         if public_key is not None:
-            from cvo_edge.signature import Trust
+            from cvo_edge.bundle.signature import Trust
 
             trust = Trust.in_key(Path(public_key))
 

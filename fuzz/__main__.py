@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from cvo_edge.profile import environment
+from cvo_edge.programs.measure import environment
 from fuzz import bundles, kills, media, sensors, simulation
 from fuzz.trials import Tally
 

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from cvo_edge.errors import SourceError
-from cvo_edge.records import read_records
+from cvo_edge.output.records import read_records
 from fuzz.bundles import ARTIFACTS
 from fuzz.trials import Tally, beside_each_other
 
 BUNDLE, CLIP = ARTIFACTS / "synthetic-room-cjp-int8", ARTIFACTS / "synthetic-room-clip"
-_PROGRAM = "from cvo_edge.cli import main; main()"
+_PROGRAM = "from cvo_edge.__main__ import main; main()"
 _LONGEST_S, _ATTEMPTS = 60.0, 3
 
 

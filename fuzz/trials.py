@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-_PROGRAM = "from cvo_edge.cli import main; main()"
+_PROGRAM = "from cvo_edge.__main__ import main; main()"
 
 
 @dataclass

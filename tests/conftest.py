@@ -12,10 +12,10 @@ import msgspec
 import pytest
 from hypothesis import settings
 
-from cvo_edge import artifact
-from cvo_edge.artifact import Bundle, Calibration, Threshold
+from cvo_edge.bundle.format import CALIBRATION_FILE, Calibration, Threshold
+from cvo_edge.bundle.reading import Bundle, encode_calibration, read_bundle
 from cvo_edge.heads import HEADS, Head
-from cvo_edge.pose import Scope
+from cvo_edge.sets import Scope
 
 # Shared machines are slow now and then: a law that holds late still holds.
 settings.register_profile("project", deadline=None)
@@ -50,7 +50,7 @@ def clip_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def bundle(bundle_dir: Path) -> Bundle:
-    return artifact.read_bundle(bundle_dir)
+    return read_bundle(bundle_dir)
 
 
 @pytest.fixture
@@ -64,8 +64,8 @@ def rewrite(copied_bundle: Path) -> Callable[[Calibration], Path]:
     """Write another calibration into the copied bundle, with its digest made to fit."""
 
     def write(calibration: Calibration) -> Path:
-        content = artifact.encode_calibration(calibration)
-        (copied_bundle / artifact.CALIBRATION_FILE).write_bytes(content)
+        content = encode_calibration(calibration)
+        (copied_bundle / CALIBRATION_FILE).write_bytes(content)
         return copied_bundle
 
     return write

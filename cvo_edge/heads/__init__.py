@@ -13,13 +13,13 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import Calibration, Threshold
+from cvo_edge.bundle.format import Calibration, Threshold
 from cvo_edge.conformal import JointScale
 from cvo_edge.heads.cjp import CjpHead
 from cvo_edge.heads.cqr import CqrHead
 from cvo_edge.heads.csp import CspHead
 from cvo_edge.heads.mcqr import McqrHead
-from cvo_edge.pose import ConformalSet, Scope
+from cvo_edge.sets import ConformalSet, Scope
 
 Array = NDArray[np.float64]
 

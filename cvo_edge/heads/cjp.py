@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import Calibration, SixPositive
+from cvo_edge.bundle.format import Calibration, SixPositive
 from cvo_edge.heads.cqr import CqrHead
 
 

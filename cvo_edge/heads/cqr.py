@@ -28,10 +28,10 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import Calibration, SixOrUnbounded, SixPositive, Threshold
+from cvo_edge.bundle.format import Calibration, SixOrUnbounded, SixPositive, Threshold
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
-from cvo_edge.pose import ConformalSet, Scope
+from cvo_edge.sets import ConformalSet, Scope
 
 Array = NDArray[np.float64]
 Sides = Literal["symmetric", "asymmetric", "lower", "upper"]

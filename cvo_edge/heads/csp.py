@@ -25,11 +25,11 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import Calibration, Number, Threshold
+from cvo_edge.bundle.format import Calibration, Number, Threshold
 from cvo_edge.conformal import JointScale, RankScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads.cqr import infinite_where_null
-from cvo_edge.pose import ConformalSet, Scope
+from cvo_edge.sets import ConformalSet, Scope
 
 Array = NDArray[np.float64]
 _SIX = np.arange(6)

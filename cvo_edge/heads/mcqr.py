@@ -26,11 +26,11 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import Calibration, SixPositive, Threshold
+from cvo_edge.bundle.format import Calibration, SixPositive, Threshold
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads.cqr import IntervalScore, infinite_where_null, refuse_negative
-from cvo_edge.pose import ConformalSet, Ellipsoids, Scope, scaled_distance, unbounded_set
+from cvo_edge.sets import ConformalSet, Ellipsoids, Scope, scaled_distance, unbounded_set
 
 Array = NDArray[np.float64]
 

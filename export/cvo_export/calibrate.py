@@ -1,367 +1,327 @@
-"""Scores by running the exported model through the runtime -> thresholds.
+"""A network that is already there -> a bundle: any ONNX model of the right form, or a bundle.
 
-Coverage then depends on no fidelity of the export: whatever the graph computes (8-bit included) is
-what was calibrated.
+Needs no torch. A model with the output ``pose`` alone gets the residual score; one with ``lower``
+and ``upper`` besides the scores of conformalized quantile regression. A bundle keeps its method and
+gets thresholds of other data: a new site, another camera, another light.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from pathlib import Path
+from typing import Literal
 
-import msgspec
 import numpy as np
-from msgspec import Struct
+import onnx
+from google.protobuf.message import DecodeError
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import CONFIDENCES, Bundle, Calibration, SixOrUnbounded, Threshold
-from cvo_edge.conformal import (
-    conformal_quantile,
-    effective_sample_size,
-    hierarchical_quantile,
-    interval_score,
+from cvo_edge.bundle.format import (
+    Calibration,
+    CalibrationSpec,
+    PoseLimits,
+    PoseSpec,
+    PreprocessSpec,
+    Provenance,
+    Provider,
+    TensorSpec,
 )
-from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.heads import HEADS, Head
-from cvo_edge.heads.cqr import Sides
-from cvo_edge.odometer import Observation, Odometer
-from cvo_edge.pose import ConformalSet, Scope
-from cvo_edge.selftest import observe_selftest
+from cvo_edge.bundle.reading import read_bundle
+from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageError
+from cvo_edge.geometry import mean_rotation
+from cvo_edge.heads import HEADS
+from cvo_edge.heads.cqr import CqrParameters, Sides
+from cvo_edge.heads.csp import CspParameters
+from cvo_edge.input.preprocess import Crop
+from cvo_export.bundles.draft import (
+    CAMERA_FRAME,
+    FEW_POSES_MARGIN,
+    HALF_WIDTH_FLOOR,
+    WORLD_FRAME,
+    blank_selftest,
+    known_coordinates,
+    known_space,
+    model_spec,
+    plausible,
+    six,
+    versions,
+)
+from cvo_export.bundles.thresholds import Candidate, Joint, Rule, calibrated, selected
+from cvo_export.bundles.writing import check_target, write_bundle
+from cvo_export.data.splits import Kind, Split, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
-Rule = Literal["pooled", "hierarchical"]
-Joint = Literal["max", "bonferroni"]
+GivenRotation = Literal["tangent_predicted", "euler_zyx"]
 
-SCOPES: tuple[Scope, Scope] = ("marginal", "joint")
-
-# What another score has to win on val by: smaller differences there are chance.
-_CLEARLY = 0.05
-
-
-class Candidate(NamedTuple):
-    """A score of the runtime's head and the ``method_parameters`` it goes with."""
-
-    score: str
-    parameters: Struct
+_FORMS = ({"pose": (1, 7)}, {"pose": (1, 7), "lower": (1, 6), "upper": (1, 6)})
+_FULL_TURN = float(np.pi)
+_LEAST_INPUT = 16
+_PACKAGES = ("cvo-edge", "cvo-export", "onnx", "onnxruntime", "numpy")
+# Of the raps score, where a bundle has none of its own.
+_PENALTY, _FREE_RANKS = 0.01, 5
 
 
-class Scored(NamedTuple):
-    """Scores of n frames of each scope, (n, sides, 6), and their sequence numbers (n,)."""
-
-    marginal: Array
-    joint: Array
-    sequence: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Observed:
-    """Frames that passed the frame checks, as the runtime sees them, stacked over n frames.
-
-    ``outputs`` by name (n, ...); ``point`` (n, 6) and ``truth`` (n, 6) in the bundle's chart;
-    ``pose`` (n, 7) and ``true_pose`` (n, 7); ``sequence`` (n,) the sequence number; ``invalid``
-    and ``degraded`` count the frames that the checks left out.
-    """
-
-    indices: NDArray[np.int64]
-    outputs: dict[str, NDArray[np.float32]]
-    point: Array
-    truth: Array
-    pose: Array
-    true_pose: Array
-    sequence: NDArray[np.int64]
-    invalid: int
-    degraded: int
-
-    def scored(self, head: Head) -> Scored:
-        """Return the scores of the true poses."""
-        marginal, joint = (
-            head.scores(self.outputs, self.point, self.truth, scope) for scope in SCOPES
-        )
-        return Scored(marginal, joint, self.sequence)
-
-    def regions(self, head: Head, entry: Threshold) -> list[ConformalSet]:
-        """Return the set of every frame at a threshold."""
-        return [
-            head.region(
-                {name: values[row : row + 1] for name, values in self.outputs.items()},
-                point,
-                entry,
-            )
-            for row, point in enumerate(self.point)
-        ]
-
-
-def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]) -> Observed:
-    """Run frames of a data set through the odometer's network, in order.
-
-    Raises SourceError where no frame passes the checks.
-    """
-    kept: list[int] = []
-    seen: list[Observation] = []
-    invalid = degraded = 0
-    for index in indices.tolist():
-        try:
-            image = dataset.read_image(index)
-        except SourceError:
-            image = None  # the odometer flags it as it would on the device
-        observation = odometer.observe(image, seq=index)
-        if observation.fault is not None:
-            invalid += 1
-        elif observation.doubt is not None:
-            degraded += 1
-        else:
-            kept.append(index)
-            seen.append(observation)
-    if not seen:
-        raise SourceError(
-            f"{dataset.name}: expected frames that pass the checks, found none of {len(indices)}"
-        )
-    pose = np.array([observation.pose for observation in seen])
-    true_pose = dataset.poses[kept]
-    return Observed(
-        indices=np.array(kept),
-        outputs={
-            name: np.concatenate([observation.outputs[name] for observation in seen])
-            for name in seen[0].outputs
-        },
-        point=np.array([observation.point for observation in seen]),
-        truth=odometer.chart.coordinates(true_pose, pose),
-        pose=pose,
-        true_pose=true_pose,
-        sequence=dataset.sequence[kept],
-        invalid=invalid,
-        degraded=degraded,
-    )
-
-
-def calibrated(
-    draft: Calibration,
-    model_bytes: bytes,
+def recalibrate(
+    model: Path,
     dataset: PoseDataset,
-    roles: Mapping[str, NDArray[np.int64]],
-    candidates: Sequence[Candidate],
+    bundle_dir: Path,
+    name: str,
+    *,
+    kind: Kind | None = None,
+    seed: int | None = None,
+    rule: Rule | None = None,
+    joint: Joint = "max",
+    score: str | None = None,
+    sides: Sides | None = None,
+    rotation: GivenRotation | None = None,
+    crop: Crop | None = None,
+    new_data: bool = False,
+    provider: Provider | None = None,
 ) -> Calibration:
-    """Fill in score, thresholds and self-test of a draft, by running the model on val and cal.
+    """Calibrate a model file or the model of a bundle on a data set and write the new bundle.
 
-    The draft names rule, joint scope, split and data set; val decides among the candidates, see
-    ``chosen``.
+    The data set is one that the network has not been trained on: a tenth of it (role ``val``)
+    decides between scores and compares degrees of freedom, a fifth (``test``) is left for
+    ``evaluate``, the rest gives the thresholds; of a data set with a test list of its own that
+    list alone is taken. Where it is the very data set that the bundle's run was split from, that
+    run's own ``val`` and ``cal`` are used. ``rotation`` (None: ``tangent_predicted``) and ``crop``
+    (None: ``none``) describe a model file. ``new_data`` says that a data set of the training data's
+    name holds none of its frames. ``provider`` (None: the bundle's own, else ``onnxruntime``) is
+    the engine that the new bundle is for.
 
     Raises
     ------
-    BundleMismatchError, CalibrationFileError
-        The model or a candidate is not of the draft's method.
-    SourceError
-        No frame of val or cal passes the checks.
-    UsageError
-        Bonferroni's joint scope of a method that has a joint score.
+    ModelError, BundleMismatchError
+        The file is no model, or has other inputs and outputs.
+    CalibrationFileError
+        The folder is no bundle.
+    SourceError, UsageError
+        The data set is too small, its frames do not pass the checks, or they may be those that the
+        network was trained on; or an option that has no meaning here.
+    SinkError
+        The new folder cannot be written.
     """
-    if draft.calibration.joint == "bonferroni" and HEADS[draft.method].one_joint_score:
-        raise UsageError(
-            f"joint: expected max for {draft.method}, which has one score for all six, found "
-            "bonferroni"
+    check_target(bundle_dir)
+    if model.is_dir():
+        if rotation is not None or crop is not None:
+            raise UsageError("rotation, crop: expected with an ONNX file, found with a bundle")
+        bundle = read_bundle(model)
+        split = _split_of(bundle.calibration, dataset, kind, seed, new_data)
+        draft = bundle.calibration
+        if split.purpose == "calibration":
+            draft = _with_wider_limits(draft, dataset.poses[split.roles["val"]])
+        model_bytes = bundle.model_bytes
+        candidates = _own_candidates(bundle.calibration)
+    else:
+        model_bytes = _read_model(model)
+        split = _new_split(dataset, kind, seed)
+        draft = _from_model(
+            model_bytes, dataset, split, name, rotation or "tangent_predicted", crop or "none"
         )
-    first = with_candidate(draft, candidates[0])
-    with Odometer(Bundle(first, model_bytes)) as odometer:
-        val = observe(odometer, dataset, roles["val"])
-        cal = observe(odometer, dataset, roles["cal"])
-        selftest = {
-            name: tuple(float(f"{value:.9g}") for value in values.reshape(-1).tolist())
-            for name, values in observe_selftest(odometer).outputs.items()
-        }
-    scored = with_candidate(draft, chosen(draft, val, candidates))
-    scored = replace(scored, selftest=replace(scored.selftest, outputs=selftest))
-    return with_thresholds(scored, val, cal)
-
-
-def with_thresholds(calibration: Calibration, val: Observed, cal: Observed) -> Calibration:
-    """Return the calibration with the thresholds of these observations, and their counts.
-
-    Rule, joint scope and score are its own; val compares degrees of freedom for the joint scope.
-
-    Raises UsageError for a rule that is not computed here.
-    """
-    head = HEADS[calibration.method](calibration)
-    cal_scores = cal.scored(head)
-    source, rule = calibration.calibration, rule_of(calibration)
-    return replace(
-        calibration,
-        thresholds=thresholds(head, cal_scores, val.scored(head), rule, source.joint),
-        calibration=replace(
-            source,
-            n=len(cal.indices),
-            n_sequences=len(np.unique(cal.sequence)),
-            n_effective=round(effective_frames(cal_scores), 1),
-        ),
+        candidates = _given_candidates(draft)
+    if rule is None:
+        rule = "hierarchical" if split.kind == "sequence" else "pooled"
+    source = replace(
+        draft.calibration, rule=rule, joint=joint, split=split.spec(dataset), dataset=dataset.name
     )
-
-
-def selected(
-    candidates: Sequence[Candidate], score: str | None, sides: Sides | None
-) -> tuple[Candidate, ...]:
-    """Return the candidates of this score, all if it is None, with these sides, if not None.
-
-    Raises UsageError for a score or sides that the method does not have.
-    """
-    names = list(dict.fromkeys(candidate.score for candidate in candidates))
-    if score is not None and score not in names:
-        raise UsageError(f"score: expected one of {', '.join(names)}, found {score}")
-    kept = [c for c in candidates if score in (None, c.score)]
-    if sides is None or (sides == "symmetric" and "sides" not in _names(kept[0])):
-        return tuple(kept)
-    if any("sides" not in _names(candidate) for candidate in kept):
-        raise UsageError(f"sides: expected symmetric, as the method has no others, found {sides}")
-    return tuple(c._replace(parameters=replace(c.parameters, sides=sides)) for c in kept)
-
-
-def _names(candidate: Candidate) -> tuple[str, ...]:
-    return candidate.parameters.__struct_fields__
-
-
-def with_candidate(draft: Calibration, candidate: Candidate) -> Calibration:
-    """Return the draft with this score and its parameters, everything unbounded."""
-    symmetric = getattr(candidate.parameters, "sides", "symmetric") == "symmetric"
-    unbounded: SixOrUnbounded = (None,) * 6
-    entries = tuple(
-        Threshold(
-            confidence=confidence,
-            scope=scope,
-            q_hat=unbounded,
-            q_hat_upper=None if symmetric else unbounded,
-        )
-        for confidence in CONFIDENCES
-        for scope in SCOPES
-    )
-    return replace(
+    own = provider or draft.model.provider
+    made = {**draft.provenance.created_with, **versions((*_PACKAGES, own))}
+    draft = replace(
         draft,
-        thresholds=entries,
-        method_parameters=msgspec.to_builtins(candidate.parameters),
-        calibration=replace(draft.calibration, score=candidate.score),
+        name=name,
+        calibration=source,
+        model=replace(draft.model, provider=own),
+        provenance=replace(draft.provenance, created_with=made),
+    )
+    chosen_from = selected(candidates, score, sides)
+    calibration = calibrated(draft, model_bytes, dataset, split.roles, chosen_from)
+    return write_bundle(bundle_dir, calibration, model_bytes)
+
+
+def _split_of(
+    calibration: Calibration,
+    dataset: PoseDataset,
+    kind: Kind | None,
+    seed: int | None,
+    new_data: bool,
+) -> Split:
+    """The run's own split where the data set is the run's, else one of frames new to it."""
+    trained_on, name = calibration.provenance.training_split, calibration.provenance.dataset
+    if trained_on is None:
+        return _new_split(dataset, kind, seed)
+    try:
+        split = same_split(dataset, trained_on)
+    except (SourceError, UsageError):
+        if dataset.name == name and not new_data:
+            raise UsageError(
+                f"data set: expected frames that the network was not trained on, found other "
+                f"frames of the training data's name, {name}; --new-data says that they are new"
+            ) from None
+        return _new_split(dataset, kind, seed)
+    if kind is not None or seed is not None:
+        raise UsageError(
+            "split, seed: expected none on the data set that the bundle was trained on, whose own "
+            "roles are used, found some"
+        )
+    return split
+
+
+def _new_split(dataset: PoseDataset, kind: Kind | None, seed: int | None) -> Split:
+    kind = kind or default_kind(dataset, "calibration")
+    return make_split(dataset, kind, seed or 0, "calibration")
+
+
+def _read_model(path: Path) -> bytes:
+    if not path.is_file():
+        raise ModelError(f"{path}: expected an ONNX file or a bundle folder, found none")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _opset(model_bytes: bytes) -> int:
+    try:
+        model = onnx.load_from_string(model_bytes)
+    except DecodeError:
+        raise ModelError("model: expected an ONNX file, found something else") from None
+    versions = [entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")]
+    return int(max(versions, default=1))
+
+
+def _from_model(
+    model_bytes: bytes,
+    dataset: PoseDataset,
+    split: Split,
+    name: str,
+    rotation: GivenRotation,
+    crop: Crop,
+) -> Calibration:
+    """Draft for a model that nothing is known of but its tensors and the data's poses."""
+    spec = model_spec(model_bytes, _opset(model_bytes))
+    outputs = {tensor.name: tensor.shape for tensor in spec.outputs}
+    shape = spec.inputs[0].shape if len(spec.inputs) == 1 else ()
+    image = {"name": "image", "dtype": "uint8", "shape": (1, *shape[1:3], 3)}
+    if outputs not in _FORMS or [_fields(tensor) for tensor in spec.inputs] != [image]:
+        raise BundleMismatchError(
+            "model: expected the input image uint8 [1, height, width, 3] and the outputs pose "
+            "[1, 7] or pose, lower, upper [1, 6], found "
+            + ", ".join(
+                f"{t.name} {t.dtype} {list(t.shape)}" for t in (*spec.inputs, *spec.outputs)
+            )
+        )
+    if min(shape[1:3]) < _LEAST_INPUT:
+        raise BundleMismatchError(
+            f"model: expected an input of at least {_LEAST_INPUT}x{_LEAST_INPUT} pixels, found "
+            f"{shape[2]}x{shape[1]}"
+        )
+    reference, limits, deviation = known_space(dataset.poses[split.roles["val"]])
+    if rotation == "euler_zyx" or reference is None:
+        reference, limits = None, _with_any_rotation(limits)
+    return Calibration(
+        schema_version=1,
+        name=name,
+        method="cqr",
+        model=spec,
+        preprocess=PreprocessSpec(
+            height=shape[1],
+            width=shape[2],
+            colour_order="rgb",
+            interpolation="halve_then_linear_exact",
+            crop=crop,
+            mean=None,
+            std=None,
+            layout="nhwc",
+            in_graph=("cast", "transpose", "normalise"),
+        ),
+        pose=PoseSpec(
+            target="absolute",
+            frame_id=WORLD_FRAME,
+            child_frame_id=CAMERA_FRAME,
+            rotation=rotation,
+            reference_q_xyzw=reference,
+            units=("m", "rad"),
+            limits=limits,
+            standard_deviation=deviation,
+        ),
+        thresholds=(),
+        method_parameters={},
+        calibration=CalibrationSpec(
+            score="",
+            joint="max",
+            rule="pooled",
+            n=1,
+            n_sequences=1,
+            n_effective=1.0,
+            split=split.spec(dataset),
+            dataset=dataset.name,
+        ),
+        selftest=blank_selftest(spec.precision),
+        provenance=Provenance(
+            created_with=versions(_PACKAGES),
+            seed=split.seed,
+            backbone=None,
+            weights_sha256=None,
+            dataset=dataset.name,
+            training_split=None,
+            options={},
+        ),
+        digest="0" * 64,
     )
 
 
-def chosen(draft: Calibration, val: Observed, candidates: Sequence[Candidate]) -> Candidate:
-    """Return the first candidate, unless another's sets on val, thresholded there, clearly win.
-
-    By the interval score at 0.9 over each DoF's deviation; val is too small to tell closer ones
-    apart.
-    """
-    results = []
-    for candidate in candidates:
-        calibration = with_candidate(draft, candidate)
-        head = HEADS[calibration.method](calibration)
-        scores = head.scores(val.outputs, val.point, val.truth)
-        entry = _threshold(0.9, "marginal", marginal_thresholds(head, scores, 0.9, _pooled))
-        limits = workspace(calibration)
-        regions = [region.within(*limits) for region in val.regions(head, entry)]
-        width = np.array([region.width() for region in regions])
-        distance = np.array([r.distance(y) for r, y in zip(regions, val.truth, strict=True)])
-        deviation = np.array(calibration.pose.standard_deviation)
-        results.append(float((interval_score(width, distance, 0.1) / deviation).mean()))
-    best = int(np.argmin(results))
-    return candidates[best if results[best] < (1.0 - _CLEARLY) * results[0] else 0]
+def _fields(tensor: TensorSpec) -> dict[str, object]:
+    return {"name": tensor.name, "dtype": tensor.dtype, "shape": tensor.shape}
 
 
-def workspace(calibration: Calibration) -> tuple[Array, Array]:
-    """Lowest and highest value per DoF, (6,) each, that stand in for an unbounded side."""
-    limits = calibration.pose.limits
-    lowest, highest = np.array(limits.lowest), np.array(limits.highest)
-    if calibration.pose.rotation == "tangent_predicted":
-        # Offsets about the prediction: at most a half turn.
-        lowest[3:], highest[3:] = -np.pi, np.pi
-    return lowest, highest
-
-
-def thresholds(
-    head: Head, cal: Scored, val: Scored, rule: Rule, joint: Joint
-) -> tuple[Threshold, ...]:
-    """Both scopes at every confidence, from scores on cal.
-
-    ``pooled`` counts frames, ``hierarchical`` sequences; what too few of them cannot support is
-    unbounded (null). Joint scope: ``max``, the largest score of a frame, made comparable on val;
-    or ``bonferroni``, six sets at a sixth of the miscoverage each. Scores that are one for all six
-    are equal and stay so.
-    """
-
-    def q_hat(scores: Array, confidence: float) -> float:
-        if rule == "hierarchical":
-            return hierarchical_quantile(scores, cal.sequence, confidence)
-        return conformal_quantile(scores, confidence)
-
-    scale = head.joint_scale(val.joint)
-    found = []
-    for confidence in CONFIDENCES:
-        marginal = marginal_thresholds(head, cal.marginal, confidence, q_hat)
-        found.append(_threshold(confidence, "marginal", marginal))
-        if joint == "bonferroni":
-            each = 1.0 - (1.0 - confidence) / 6
-            together = marginal_thresholds(head, cal.marginal, each, q_hat)
-        else:
-            used = _used_sides(head)
-            largest = scale.comparable(cal.joint)[:, used].max(axis=(1, 2))
-            together = np.full(cal.joint.shape[1:], np.inf)
-            together[used] = scale.thresholds(q_hat(largest, confidence))[used]
-        found.append(_threshold(confidence, "joint", together))
-    return tuple(found)
-
-
-def marginal_thresholds(
-    head: Head, scores: Array, confidence: float, q_hat: Callable[[Array, float], float]
-) -> Array:
-    """Scores (n, sides, 6) -> thresholds (sides, 6), infinite where unbounded."""
-    found = np.full(scores.shape[1:], np.inf)
-    for side, level in enumerate(head.side_confidences(confidence)):
-        if level is not None:
-            found[side] = [q_hat(scores[:, side, dof], level) for dof in range(6)]
-    return found
-
-
-def rule_of(calibration: Calibration) -> Rule:
-    """The calibration rule of a bundle; raises UsageError for one that is not computed here."""
-    rule = calibration.calibration.rule
-    if rule == "weighted":
-        raise UsageError("rule: expected pooled or hierarchical, found weighted")
-    return rule
-
-
-def effective_frames(scored: Scored) -> float:
-    """Independent frames that marginal scores are worth: the least over all columns.
-
-    Summed over sequences, which are independent of each other. An infinite score counts as the
-    largest finite one.
-    """
-    columns = [
-        np.minimum(column, column[np.isfinite(column)].max(initial=0.0))
-        for column in scored.marginal.reshape(len(scored.marginal), -1).T
-    ]
-    sequence = scored.sequence
-    return min(
-        sum(effective_sample_size(column[sequence == number]) for number in np.unique(sequence))
-        for column in columns
+def _with_any_rotation(limits: PoseLimits) -> PoseLimits:
+    """Keep the limits of the position; any rotation is plausible."""
+    return PoseLimits(
+        lowest=(*limits.lowest[:3], *(-_FULL_TURN,) * 3),
+        highest=(*limits.highest[:3], *(_FULL_TURN,) * 3),
     )
 
 
-def _used_sides(head: Head) -> NDArray[np.bool_]:
-    return np.array([level is not None for level in head.side_confidences(0.9)])
-
-
-def _pooled(scores: Array, confidence: float) -> float:
-    return conformal_quantile(scores, confidence)
-
-
-def _threshold(confidence: float, scope: Scope, values: Array) -> Threshold:
-    """Thresholds (sides, 6), infinite where unbounded, as they are stored."""
-    sides = [_six_or_unbounded(row) for row in values]
-    return Threshold(
-        confidence=confidence,
-        scope=scope,
-        q_hat=sides[0],
-        q_hat_upper=sides[1] if len(sides) == 2 else None,
+def _with_wider_limits(calibration: Calibration, poses: Array) -> Calibration:
+    """Let a bundle's limits hold the poses (n, 7) of the new data, too."""
+    pose = calibration.pose
+    if pose.reference_q_xyzw is None:
+        coordinates = known_coordinates(poses, mean_rotation(poses[:, 3:]))
+        found = _with_any_rotation(plausible(coordinates, FEW_POSES_MARGIN))
+    else:
+        coordinates = known_coordinates(poses, np.array(pose.reference_q_xyzw))
+        found = plausible(coordinates, FEW_POSES_MARGIN)
+    limits = PoseLimits(
+        lowest=six(np.minimum(pose.limits.lowest, found.lowest)),
+        highest=six(np.maximum(pose.limits.highest, found.highest)),
     )
+    return replace(calibration, pose=replace(pose, limits=limits))
 
 
-def _six_or_unbounded(values: Array) -> SixOrUnbounded:
-    a, b, c, d, e, f = (float(value) if np.isfinite(value) else None for value in values)
-    return (a, b, c, d, e, f)
+def _given_candidates(draft: Calibration) -> tuple[Candidate, ...]:
+    floor = six(HALF_WIDTH_FLOOR * np.array(draft.pose.standard_deviation))
+    parameters = CqrParameters(half_width_floor=floor, sides="symmetric")
+    scores = ("residual",) if len(draft.model.outputs) == 1 else ("normalised", "additive")
+    return tuple(Candidate(score, parameters) for score in scores)
+
+
+def _own_candidates(calibration: Calibration) -> tuple[Candidate, ...]:
+    """A bundle's own score first, then what else its method could use with these parameters."""
+    head = HEADS[calibration.method]
+    parameters = calibration.parameters(head.parameters_type)
+    own = Candidate(calibration.calibration.score, parameters)
+    if isinstance(parameters, CspParameters):
+        raps = parameters
+        if parameters.penalty == 0.0:
+            raps = replace(parameters, penalty=_PENALTY, free_ranks=_FREE_RANKS)
+        family: tuple[Candidate, ...] = (
+            Candidate("aps", parameters),
+            Candidate("lac", parameters),
+            Candidate("raps", raps),
+        )
+    elif own.score == "residual":
+        family = (own,)
+    else:
+        family = (Candidate("normalised", parameters), Candidate("additive", parameters))
+    return (own, *(other for other in family if other.score != own.score))

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from cvo_edge.cli import ScopeName, guarded, write_text
 from cvo_edge.errors import UsageError
+from cvo_edge.files import write_text
+from cvo_edge.process import guarded, quiet_libraries
+from cvo_edge.programs.cli import ScopeName
 from cvo_export.progress import show_progress
 
 if TYPE_CHECKING:
@@ -366,9 +368,9 @@ def train(
 
     Options that begin with the name of a method belong to that method.
     """
-    from cvo_export.configure import configure
-    from cvo_export.splits import default_kind
-    from cvo_export.train import train as train_run
+    from cvo_export.data.splits import default_kind
+    from cvo_export.training.configure import configure
+    from cvo_export.training.loop import train as train_run
 
     opened = _open(dataset)
     config = configure(
@@ -457,9 +459,9 @@ def publish(
     ] = None,
 ) -> None:
     """Export a run to ONNX, calibrate that graph and write its bundle."""
-    from cvo_edge.describe import inspect_lines
+    from cvo_edge.programs.inspect import inspect_lines
     from cvo_export.publish import publish as publish_run
-    from cvo_export.run import load_run
+    from cvo_export.training.run import load_run
 
     calibration = publish_run(
         load_run(run_dir, dataset),
@@ -513,8 +515,8 @@ def calibrate(
     An ONNX file has the input image, uint8 [1, height, width, 3], RGB, and the outputs pose [1, 7]
     and, for intervals that adapt, lower and upper [1, 6].
     """
-    from cvo_edge.describe import inspect_lines
-    from cvo_export.recalibrate import recalibrate
+    from cvo_edge.programs.inspect import inspect_lines
+    from cvo_export.calibrate import recalibrate
 
     calibration = recalibrate(
         model,
@@ -583,9 +585,9 @@ def evaluate(
     calibration frames degraded alike. NAME is gaussian, salt-and-pepper, speckle, motion-blur,
     exposure or occlusion.
     """
+    from cvo_export.data.noise import parse_noise
     from cvo_export.evaluate import check_coverage, table
     from cvo_export.evaluate import evaluate as evaluate_bundle
-    from cvo_export.noise import parse_noise
 
     parsed = None if noise is None else parse_noise(noise)
     report = evaluate_bundle(bundle, _open(dataset), subset.value, threads, parsed)
@@ -626,8 +628,8 @@ def compare(
 
     Interrupted, the same command goes on. OUT gets compare.json and the table compare.txt.
     """
-    from cvo_export.compare import compare as compare_methods
-    from cvo_export.methods import TRAINABLE
+    from cvo_export.networks.methods import TRAINABLE
+    from cvo_export.study.compare import compare as compare_methods
 
     _open(dataset)
     options = {
@@ -675,12 +677,12 @@ def study(
 
     Interrupted, the same command goes on. OUT gets results.json, report.html and pictures.
     """
-    from cvo_edge.session import allowed_cores
-    from cvo_export.cells import CellFolder
-    from cvo_export.ray_engine import ray_engine
-    from cvo_export.study import read_study, run_study
-    from cvo_export.study_report import page_template, write_report
-    from cvo_export.workers import run_tasks
+    from cvo_edge.cores import allowed_cores
+    from cvo_export.study.cells import CellFolder
+    from cvo_export.study.grid import read_study, run_study
+    from cvo_export.study.ray_engine import ray_engine
+    from cvo_export.study.report import page_template, write_report
+    from cvo_export.study.workers import run_tasks
 
     if engine is EngineName.RAY and jobs is not None:
         raise UsageError("jobs: expected with the engine local alone, found it with ray")
@@ -755,4 +757,5 @@ def dataset(dataset: DatasetArgument) -> None:
 
 def main() -> NoReturn:
     """Entry point of ``cvo-export``."""
+    quiet_libraries()
     guarded("cvo-export", app)

@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 from scipy.stats import betabinom, spearmanr
 
 from cvo_edge import geometry
-from cvo_edge.artifact import Calibration, Threshold, read_bundle
+from cvo_edge.bundle.format import Calibration, Threshold
+from cvo_edge.bundle.reading import read_bundle
 from cvo_edge.conformal import conformal_rank, interval_score
 from cvo_edge.errors import GateError, UsageError
 from cvo_edge.heads.cqr import CqrHead, IntervalScore
 from cvo_edge.heads.csp import CspHead
 from cvo_edge.odometer import Odometer
-from cvo_edge.pose import ConformalSet
-from cvo_export.calibrate import (
+from cvo_edge.sets import ConformalSet
+from cvo_export.bundles.thresholds import (
     Observed,
     Rule,
     effective_frames,
@@ -29,10 +30,10 @@ from cvo_export.calibrate import (
     with_thresholds,
     workspace,
 )
+from cvo_export.bundles.volume import ellipsoids_log_volume
+from cvo_export.data.noise import Noise, noisy
+from cvo_export.data.splits import Split, same_split
 from cvo_export.datasets import PoseDataset
-from cvo_export.noise import Noise, noisy
-from cvo_export.splits import Split, same_split
-from cvo_export.volume import ellipsoids_log_volume
 
 Array = NDArray[np.float64]
 Subset = Literal["test", "all"]

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.artifact import Calibration
+from cvo_edge.bundle.format import Calibration
 from cvo_edge.errors import SinkError, SourceError, UsageError
+from cvo_edge.estimate import PoseInterval
+from cvo_edge.input.frame import Frame
 from cvo_edge.odometer import Odometer
-from cvo_edge.pose import Chart, PoseInterval, Scope
-from cvo_edge.sources import Frame
+from cvo_edge.pose import Chart
+from cvo_edge.sets import Scope
 from cvo_export.datasets import PoseDataset
 from cvo_export.evaluate import Subset, subset_indices
 

@@ -10,27 +10,34 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cvo_edge import artifact, preprocess
-from cvo_edge.artifact import Calibration, Precision, Provider
+from cvo_edge.bundle.format import (
+    Calibration,
+    CalibrationSpec,
+    PoseSpec,
+    Precision,
+    PreprocessSpec,
+    Provenance,
+    Provider,
+)
+from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
 from cvo_edge.heads.cqr import Sides
-from cvo_edge.session import Session
-from cvo_export.bundle import (
+from cvo_edge.input import preprocess
+from cvo_export.bundles.draft import (
     CAMERA_FRAME,
     WORLD_FRAME,
     blank_selftest,
-    check_target,
     four,
     model_spec,
     plausible,
     six,
     versions,
-    write_bundle,
 )
-from cvo_export.calibrate import Joint, Rule, calibrated, selected
-from cvo_export.quantise import quantised
-from cvo_export.run import Run
-from cvo_export.to_onnx import OPSET, check_parity, export_onnx
+from cvo_export.bundles.thresholds import Joint, Rule, calibrated, selected
+from cvo_export.bundles.writing import check_target, write_bundle
+from cvo_export.graph.quantise import quantised
+from cvo_export.graph.to_onnx import OPSET, check_parity, export_onnx
+from cvo_export.training.run import Run
 
 Array = NDArray[np.float64]
 
@@ -153,7 +160,7 @@ def _draft(
         name=name,
         method=run.graph.head.runtime_method,
         model=model,
-        preprocess=artifact.PreprocessSpec(
+        preprocess=PreprocessSpec(
             height=config.height,
             width=config.width,
             colour_order="rgb",
@@ -164,7 +171,7 @@ def _draft(
             layout="nhwc",
             in_graph=("cast", "transpose", "normalise"),
         ),
-        pose=artifact.PoseSpec(
+        pose=PoseSpec(
             target="absolute",
             frame_id=WORLD_FRAME,
             child_frame_id=CAMERA_FRAME,
@@ -176,7 +183,7 @@ def _draft(
         ),
         thresholds=(),
         method_parameters={},
-        calibration=artifact.CalibrationSpec(
+        calibration=CalibrationSpec(
             score="",
             joint=joint,
             rule=rule,
@@ -187,7 +194,7 @@ def _draft(
             dataset=run.dataset.name,
         ),
         selftest=blank_selftest(model.precision),
-        provenance=artifact.Provenance(
+        provenance=Provenance(
             created_with=versions((*_PACKAGES, provider)),
             seed=config.seed,
             backbone=config.backbone.name,

@@ -1,4 +1,4 @@
-"""Signing a bundle: the private key's side of ``cvo_edge.signature``."""
+"""Signing a bundle: the private key's side of ``cvo_edge.bundle.signature``."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from cvo_edge.artifact import Calibration, read_bundle
-from cvo_edge.errors import UsageError
-from cvo_edge.files import read_regular_file
-from cvo_edge.signature import (
+from cvo_edge.bundle.format import Calibration
+from cvo_edge.bundle.reading import read_bundle
+from cvo_edge.bundle.signature import (
     HIGHEST_VERSION,
     MAX_KEY_BYTES,
     SIGNATURE_FILE,
     Signature,
     message,
 )
+from cvo_edge.errors import UsageError
+from cvo_edge.files import read_regular_file
 from cvo_export.files import write_json
 
 if TYPE_CHECKING:

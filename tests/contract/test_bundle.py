@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cvo_edge import (
-    BundleMismatchError,
-    CalibrationFileError,
-    ModelError,
-    Odometer,
-    artifact,
+from cvo_edge import BundleMismatchError, CalibrationFileError, ModelError, Odometer
+from cvo_edge.bundle.format import MODEL_FILE
+from cvo_edge.bundle.reading import (
+    decode_calibration,
+    encode_calibration,
+    read_bundle,
+    read_calibration,
 )
-from cvo_edge.artifact import decode_calibration, encode_calibration, read_bundle, read_calibration
 
 
 def redigested(document):
@@ -411,7 +411,7 @@ def test_a_swapped_model_with_the_digest_made_to_fit_disagrees_in_its_tensors(
         if output.name == "pose":
             output.name = "posture"
     content = model.SerializeToString()
-    (copied_bundle / artifact.MODEL_FILE).write_bytes(content)
+    (copied_bundle / MODEL_FILE).write_bytes(content)
     digest = hashlib.sha256(content).hexdigest()
     spec = msgspec.structs.replace(bundle.calibration.model, sha256=digest)
     rewrite(msgspec.structs.replace(bundle.calibration, model=spec))
@@ -421,7 +421,7 @@ def test_a_swapped_model_with_the_digest_made_to_fit_disagrees_in_its_tensors(
 
 def test_bytes_that_are_no_model_are_refused_by_the_engine(copied_bundle, rewrite, bundle):
     content = b"no model at all"
-    (copied_bundle / artifact.MODEL_FILE).write_bytes(content)
+    (copied_bundle / MODEL_FILE).write_bytes(content)
     digest = hashlib.sha256(content).hexdigest()
     spec = msgspec.structs.replace(bundle.calibration.model, sha256=digest)
     rewrite(msgspec.structs.replace(bundle.calibration, model=spec))

@@ -18,13 +18,13 @@ import pytest
 
 from cvo_edge import Odometer, open_source, read_records
 
-CVO_EDGE = [sys.executable, "-c", "from cvo_edge.cli import main; main()"]
+CVO_EDGE = [sys.executable, "-c", "from cvo_edge.__main__ import main; main()"]
 # Whoever runs the suite in the background of a script has it ignore SIGINT, and its children too.
 FOREGROUND = [
     sys.executable,
     "-c",
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "from cvo_edge.cli import main; main()",
+    "from cvo_edge.__main__ import main; main()",
 ]
 
 

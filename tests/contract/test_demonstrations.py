@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from cvo_edge import Odometer, open_source
-from cvo_edge.selftest import check_selftest
-from cvo_edge.trajectory import open_ground_truth
+from cvo_edge.ground_truth import open_ground_truth
+from cvo_edge.programs.selftest import check_selftest
 
 ARTIFACTS = Path(__file__).resolve().parents[2] / "calibration_artifacts"
 METHODS = ["cjp", "cqr", "csp", "mcqr"]

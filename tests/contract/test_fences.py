@@ -23,7 +23,7 @@ def fresh_process(code):
 
 def test_every_module_of_the_runtime_imports_without_the_training_side():
     names = [name.removesuffix(".__init__") for name in MODULES]
-    assert "cvo_edge.cli" in names
+    assert "cvo_edge.programs.cli" in names
     assert "cvo_edge.heads.cjp" in names
     code = f"import importlib, sys\nfor name in {names}: importlib.import_module(name)\n"
     found = fresh_process(code + "print(*sys.modules, sep='\\n')").stdout.splitlines()

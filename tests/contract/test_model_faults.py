@@ -6,11 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from cvo_edge import Bundle, ModelError, Odometer, Reason, Status, artifact
-from cvo_edge.artifact import CONFIDENCES, Threshold, decode_calibration, encode_calibration
+from cvo_edge import Bundle, ModelError, Odometer, Reason, Status
+from cvo_edge.bundle.format import CONFIDENCES, PoseLimits, Threshold
+from cvo_edge.bundle.reading import decode_calibration, encode_calibration
+from cvo_edge.engine.session import Session
 from cvo_edge.geometry import euler_zyx_to_quaternion
-from cvo_edge.preprocess import selftest_image
-from cvo_edge.session import Session
+from cvo_edge.input.preprocess import selftest_image
 
 onnx = pytest.importorskip("onnx")
 
@@ -54,7 +55,7 @@ def odometer(
     model = msgspec.structs.replace(
         calibration.model, sha256=hashlib.sha256(model_bytes).hexdigest()
     )
-    limits = artifact.PoseLimits(lowest=(-4.0,) * 6, highest=(4.0,) * 6)
+    limits = PoseLimits(lowest=(-4.0,) * 6, highest=(4.0,) * 6)
     changed = msgspec.structs.replace(
         calibration,
         model=model,

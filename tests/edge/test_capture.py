@@ -17,15 +17,16 @@ import numpy as np
 import pytest
 
 from cvo_edge import SourceError, UsageError, open_source, read_records
-from cvo_edge.capture import Arrivals, shown
-from cvo_edge.sources import PAUSES_S, Camera
+from cvo_edge.input.capture import shown
+from cvo_edge.input.queue_lag import Arrivals
+from cvo_edge.input.sources import PAUSES_S, Camera
 
 pytestmark = pytest.mark.clock
 
 # Whoever runs the suite in the background of a script has it ignore SIGINT, and its children too.
 RUN = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "from cvo_edge.cli import main; main()"
+    "from cvo_edge.__main__ import main; main()"
 )
 BOUNDARY = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n"
 
@@ -98,7 +99,7 @@ def network_camera(clip_dir):
 @pytest.fixture
 def hasty(monkeypatch):
     """Attempts without pauses between them."""
-    monkeypatch.setattr("cvo_edge.sources.PAUSES_S", (0.01,) * len(PAUSES_S))
+    monkeypatch.setattr("cvo_edge.input.sources.PAUSES_S", (0.01,) * len(PAUSES_S))
 
 
 def test_a_stream_that_hangs_or_ends_is_opened_again_and_goes_on(network_camera, caplog):
@@ -335,8 +336,8 @@ def test_an_address_of_single_pictures_is_no_camera(network_camera, hasty):
 def test_stop_ends_the_wait_for_a_camera_that_does_not_open(tmp_path):
     script = """
 import os, sys, threading, time
-from cvo_edge.sources import Camera
-import cvo_edge.sources as sources
+from cvo_edge.input.sources import Camera
+import cvo_edge.input.sources as sources
 
 camera = Camera.__new__(Camera)
 threading.Timer(1.0, lambda: camera.stop()).start()

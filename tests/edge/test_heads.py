@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from cvo_edge.artifact import Threshold
+from cvo_edge.bundle.format import Threshold
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads.cqr import IntervalScore
 from cvo_edge.heads.csp import Score, class_scores
-from cvo_edge.pose import scaled_distance
+from cvo_edge.sets import scaled_distance
 
 FLOOR = [0.01] * 6
 GRID = np.linspace(-3.0, 3.0, 241)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cvo_edge import Odometer, Reason, Status, UsageError, open_source
-from cvo_edge.trajectory import open_ground_truth
+from cvo_edge.ground_truth import open_ground_truth
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,9 @@ from hypothesis.extra.numpy import arrays
 
 from cvo_edge import geometry
 from cvo_edge.errors import UsageError
-from cvo_edge.pose import Chart, ConformalSet, Pose, PoseInterval, Reason, Status, unbounded_set
+from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.pose import Chart, Pose
+from cvo_edge.sets import ConformalSet, unbounded_set
 
 rotvecs = arrays(np.float64, 3, elements=st.floats(-1.0, 1.0))
 translations = arrays(np.float64, 3, elements=st.floats(-5.0, 5.0))

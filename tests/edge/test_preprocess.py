@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cvo_edge import preprocess
+from cvo_edge.input import preprocess
 
 
 def noise(height, width, channels=3, dtype=np.uint8):

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from cvo_edge import Odometer, SourceError, open_source, read_records
-from cvo_edge.sinks import Sink
+from cvo_edge.output.sinks import Sink
 
 
 @pytest.fixture(scope="module", params=["cjp", "csp", "mcqr"])

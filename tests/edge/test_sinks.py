@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cvo_edge import Odometer, SinkError, UsageError, open_source
-from cvo_edge.pose import unbounded_set
-from cvo_edge.sinks import Sink
+from cvo_edge.output.sinks import Sink
+from cvo_edge.sets import unbounded_set
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from cvo_edge.capture import READER
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.images import decode_image
-from cvo_edge.sources import Video, _VideoStamps, open_source
+from cvo_edge.input.capture import READER
+from cvo_edge.input.decoding import decode_image
+from cvo_edge.input.sources import Video, _VideoStamps, open_source
 
 
 def picture(value=0, height=48, width=64):

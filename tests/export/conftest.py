@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import torch
 
-from cvo_export.augment import AugmentConfig
-from cvo_export.backbone import BackboneConfig
-from cvo_export.heads.cjp import CjpConfig
+from cvo_export.data.augment import AugmentConfig
+from cvo_export.networks.backbone import BackboneConfig
+from cvo_export.networks.heads.cjp import CjpConfig
 from cvo_export.publish import publish
-from cvo_export.run import Run, TrainConfig
-from cvo_export.train import train
+from cvo_export.training.loop import train
+from cvo_export.training.run import Run, TrainConfig
 
 # Networks this small wait for threads longer than they compute.
 torch.set_num_threads(1)

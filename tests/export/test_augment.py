@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from cvo_edge import geometry
-from cvo_export.augment import (
+from cvo_export.data.augment import (
     AugmentConfig,
     augmented,
     change_light,

@@ -5,7 +5,7 @@ import torch
 from safetensors.torch import save_file
 
 from cvo_edge.errors import UsageError
-from cvo_export.backbone import Backbone, BackboneConfig, load_weights
+from cvo_export.networks.backbone import Backbone, BackboneConfig, load_weights
 
 
 def backbone(**changes):

@@ -11,25 +11,26 @@ from scipy.stats import norm
 from torch.nn.functional import linear, prelu
 
 from cvo_edge import Odometer
-from cvo_edge.artifact import Threshold, read_bundle, read_calibration
+from cvo_edge.bundle.format import Threshold
+from cvo_edge.bundle.reading import read_bundle, read_calibration
 from cvo_edge.errors import UsageError
 from cvo_edge.heads import CqrHead
-from cvo_export.backbone import BackboneConfig
-from cvo_export.baselines import BASELINES
-from cvo_export.baselines.gaussian import GaussianConfig, GaussianNetwork
-from cvo_export.baselines.mc_dropout import McDropoutConfig, McDropoutNetwork
-from cvo_export.baselines.mdn import MdnConfig, MdnNetwork, mixture_quantiles
-from cvo_export.baselines.pinball import PinballConfig, PinballNetwork
-from cvo_export.calibrate import Candidate, observe, with_candidate
+from cvo_export.bundles.thresholds import Candidate, observe, with_candidate
 from cvo_export.cli import MethodName
 from cvo_export.evaluate import evaluate, find_level, table
-from cvo_export.heads import METHODS
-from cvo_export.heads.base import Setting
-from cvo_export.methods import TRAINABLE
+from cvo_export.networks.backbone import BackboneConfig
+from cvo_export.networks.baselines import BASELINES
+from cvo_export.networks.baselines.gaussian import GaussianConfig, GaussianNetwork
+from cvo_export.networks.baselines.mc_dropout import McDropoutConfig, McDropoutNetwork
+from cvo_export.networks.baselines.mdn import MdnConfig, MdnNetwork, mixture_quantiles
+from cvo_export.networks.baselines.pinball import PinballConfig, PinballNetwork
+from cvo_export.networks.heads import METHODS
+from cvo_export.networks.heads.base import Setting
+from cvo_export.networks.methods import TRAINABLE
+from cvo_export.networks.standardised import Target
 from cvo_export.publish import publish
-from cvo_export.run import load_run
-from cvo_export.target import Target
-from cvo_export.train import train
+from cvo_export.training.loop import train
+from cvo_export.training.run import load_run
 
 from .conftest import ignore_progress, tiny_config
 from .test_train import InterruptedTrainingError, same_weights, stopping_after

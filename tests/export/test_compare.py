@@ -9,13 +9,13 @@ import torch
 from safetensors.torch import save_file
 
 from cvo_edge.errors import CvoError, SinkError, UsageError
-from cvo_export import cells, frame_times
-from cvo_export.backbone import Backbone, BackboneConfig
 from cvo_export.cli import app
-from cvo_export.compare import compare
 from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level
-from cvo_export.run import load_run
+from cvo_export.networks.backbone import Backbone, BackboneConfig
+from cvo_export.study import cells, frame_times
+from cvo_export.study.compare import compare
+from cvo_export.training.run import load_run
 
 from .conftest import DATASET, ignore_progress
 

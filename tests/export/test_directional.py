@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from cvo_edge.conformal import conformal_quantile
-from cvo_export.directional import (
+from cvo_export.networks.directional import (
     SHELLS,
     Choice,
     RegionConfig,
@@ -16,7 +16,7 @@ from cvo_export.directional import (
     scaled_distances,
     thrifty_choice,
 )
-from cvo_export.losses import pinball_loss
+from cvo_export.networks.losses import pinball_loss
 
 
 @pytest.fixture

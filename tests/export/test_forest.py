@@ -6,8 +6,8 @@ from onnx import TensorProto, helper
 from quantile_forest import RandomForestQuantileRegressor
 from sklearn.ensemble import RandomForestRegressor
 
-from cvo_edge.session import Session
-from cvo_export.forest import (
+from cvo_edge.engine.session import Session
+from cvo_export.networks.forest import (
     MAX_LEAF_ENTRIES,
     ML_DOMAIN,
     ML_OPSET,

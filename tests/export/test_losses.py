@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cvo_export.losses import (
+from cvo_export.networks.losses import (
     COVERAGE,
     CombinedCalibrationLoss,
     interval_score_loss,

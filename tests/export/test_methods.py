@@ -10,24 +10,31 @@ import pytest
 import torch
 
 from cvo_edge import Odometer
-from cvo_edge.artifact import Threshold, read_bundle, read_calibration
+from cvo_edge.bundle.format import Threshold
+from cvo_edge.bundle.reading import read_bundle, read_calibration
 from cvo_edge.conformal import conformal_quantile, interval_score
+from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError, UsageError
-from cvo_edge.session import Session
-from cvo_edge.sinks import Sink
+from cvo_edge.output.sinks import Sink
 from cvo_export import publish as publishing
-from cvo_export import train as training
-from cvo_export.calibrate import observe
-from cvo_export.configure import configure
+from cvo_export.bundles.thresholds import observe
 from cvo_export.evaluate import evaluate, find_level, table
-from cvo_export.heads.cqr import CqrConfig
-from cvo_export.heads.csp import Classes, CspConfig, CspLearner, best_temperatures, set_score
-from cvo_export.heads.mcqr import McqrConfig
-from cvo_export.heads.point import PointNetwork
+from cvo_export.networks.heads.cqr import CqrConfig
+from cvo_export.networks.heads.csp import (
+    Classes,
+    CspConfig,
+    CspLearner,
+    best_temperatures,
+    set_score,
+)
+from cvo_export.networks.heads.mcqr import McqrConfig
+from cvo_export.networks.heads.point import PointNetwork
 from cvo_export.plot import plot, track
 from cvo_export.publish import publish
-from cvo_export.run import load_run
-from cvo_export.train import train
+from cvo_export.training import loop as training
+from cvo_export.training.configure import configure
+from cvo_export.training.loop import train
+from cvo_export.training.run import load_run
 
 from .conftest import DATASET, ignore_progress, tiny_config
 from .test_train import InterruptedTrainingError, same_weights, stopping_after
@@ -89,7 +96,7 @@ def test_a_shared_cache_gives_the_same_features(tmp_path):
     # Random weights are a run's own: a file of them can be shared.
     from safetensors.torch import save_file
 
-    from cvo_export.backbone import Backbone
+    from cvo_export.networks.backbone import Backbone
 
     config = tiny_config(steps=100)
     torch.manual_seed(5)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SourceError, UsageError
+from cvo_export.calibrate import recalibrate
 from cvo_export.cli import app
+from cvo_export.data.noise import KINDS, Noise, noisy, parse_noise
+from cvo_export.data.splits import make_split, same_split
 from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level, table
-from cvo_export.noise import KINDS, Noise, noisy, parse_noise
-from cvo_export.recalibrate import recalibrate
-from cvo_export.splits import make_split, same_split
 
 from .conftest import DATASET
 

@@ -11,17 +11,18 @@ import pytest
 from msgspec.structs import replace
 from onnx import TensorProto, helper
 
-from cvo_edge.artifact import Bundle, TensorSpec, read_bundle, read_calibration
-from cvo_edge.describe import inspect_lines
+from cvo_edge.bundle.format import TensorSpec
+from cvo_edge.bundle.reading import Bundle, read_bundle, read_calibration
+from cvo_edge.engine.loading import load_bundle
+from cvo_edge.engine.model_cache import ModelCache
+from cvo_edge.engine.openvino import OpenvinoSession
 from cvo_edge.errors import ModelError
-from cvo_edge.loading import load_bundle
 from cvo_edge.odometer import Odometer
-from cvo_edge.openvino_session import OpenvinoSession
-from cvo_edge.prepared import ModelCache
-from cvo_edge.selftest import check_selftest
+from cvo_edge.programs.inspect import inspect_lines
+from cvo_edge.programs.selftest import check_selftest
+from cvo_export.calibrate import recalibrate
 from cvo_export.datasets import open_dataset
 from cvo_export.publish import publish
-from cvo_export.recalibrate import recalibrate
 
 from .conftest import DATASET
 
@@ -115,7 +116,9 @@ def test_its_models_are_not_prepared_for_the_other_engine(of_openvino, tmp_path)
 
 
 def test_without_the_package_one_line_says_what_to_install(of_openvino):
-    without = "import sys; sys.modules['openvino'] = None; from cvo_edge.cli import main; main()"
+    without = (
+        "import sys; sys.modules['openvino'] = None; from cvo_edge.__main__ import main; main()"
+    )
     command = [
         sys.executable,
         "-c",

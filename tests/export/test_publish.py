@@ -10,16 +10,17 @@ import pytest
 import torch
 
 from cvo_edge import Odometer, SinkError, SourceError
-from cvo_edge.artifact import CONFIDENCES, read_bundle, read_calibration
+from cvo_edge.bundle.format import CONFIDENCES
+from cvo_edge.bundle.reading import read_bundle, read_calibration
 from cvo_edge.conformal import conformal_quantile
+from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
-from cvo_edge.selftest import check_selftest
-from cvo_edge.session import Session
-from cvo_export.calibrate import observe
-from cvo_export.heads.cjp import CjpConfig, CjpLearner, CjpNetwork, CjpPrediction
+from cvo_edge.programs.selftest import check_selftest
+from cvo_export.bundles.thresholds import observe
+from cvo_export.graph.to_onnx import check_parity
+from cvo_export.networks.heads.cjp import CjpConfig, CjpLearner, CjpNetwork, CjpPrediction
 from cvo_export.publish import publish
-from cvo_export.to_onnx import check_parity
-from cvo_export.train import train
+from cvo_export.training.loop import train
 
 from .conftest import ignore_progress, tiny_config
 

@@ -9,20 +9,20 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from cvo_edge import session
-from cvo_edge.artifact import read_bundle
+from cvo_edge.bundle.reading import read_bundle
 from cvo_edge.conformal import conformal_quantile
+from cvo_edge.engine import session
+from cvo_edge.engine.session import Session
 from cvo_edge.errors import UsageError
 from cvo_edge.odometer import Odometer
-from cvo_edge.selftest import check_selftest
-from cvo_edge.session import Session
-from cvo_export.backbone import Backbone, BackboneConfig
-from cvo_export.calibrate import observe
-from cvo_export.heads.cqr import CqrConfig
+from cvo_edge.programs.selftest import check_selftest
+from cvo_export.bundles.thresholds import observe
+from cvo_export.graph.quantise import quantised
+from cvo_export.graph.to_onnx import export_onnx
+from cvo_export.networks.backbone import Backbone, BackboneConfig
+from cvo_export.networks.heads.cqr import CqrConfig
 from cvo_export.publish import publish
-from cvo_export.quantise import quantised
-from cvo_export.to_onnx import export_onnx
-from cvo_export.train import train
+from cvo_export.training.loop import train
 
 from .conftest import ignore_progress, tiny_config
 
@@ -125,7 +125,7 @@ def mean_shift(content, small, feeds):
 
 def test_the_mean_output_stays_where_it_was(both, monkeypatch):
     content, small, feeds = both
-    monkeypatch.setattr("cvo_export.quantise._correct_biases", lambda *_: None)
+    monkeypatch.setattr("cvo_export.graph.quantise._correct_biases", lambda *_: None)
     uncorrected = quantised(content, feeds)
     assert mean_shift(content, small, feeds) < 0.3 * mean_shift(content, uncorrected, feeds)
 

@@ -12,7 +12,7 @@ from time import monotonic
 import pytest
 
 from cvo_edge.errors import UsageError
-from cvo_export.ray_engine import ray_engine
+from cvo_export.study.ray_engine import ray_engine
 
 pytest.importorskip("ray")
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from cvo_edge import BundleMismatchError, Odometer, SinkError, UsageError
-from cvo_edge.artifact import CALIBRATION_FILE, MODEL_FILE
-from cvo_edge.guard import verify_bundle
-from cvo_edge.signature import SIGNATURE_FILE, Versions
+from cvo_edge.bundle.format import CALIBRATION_FILE, MODEL_FILE
+from cvo_edge.bundle.signature import SIGNATURE_FILE, Versions
+from cvo_edge.programs.verify import verify_bundle
 from cvo_export.sign import PASSPHRASE, sign
 
 pytest.importorskip("cryptography")
@@ -184,7 +184,7 @@ def test_a_record_of_versions_that_cannot_be_read_or_written_stops_it(copied_bun
 def test_processes_at_once_keep_the_highest(tmp_path):
     path = tmp_path / "deep" / "versions.json"
     code = (
-        "import sys; from pathlib import Path; from cvo_edge.signature import Versions\n"
+        "import sys; from pathlib import Path; from cvo_edge.bundle.signature import Versions\n"
         "versions = Versions(Path(sys.argv[1]))\n"
         "for v in range(1, 100):\n"
         "    versions.raise_to('k', sys.argv[2], v); versions.raise_to('k', 'of all', v)"

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cvo_edge.errors import SourceError, UsageError
+from cvo_export.data.splits import SHARES, deal_folds, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
-from cvo_export.splits import SHARES, deal_folds, default_kind, make_split, same_split
 
 ROLES = tuple(SHARES["training"])
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import UsageError
-from cvo_export import cells
-from cvo_export.cells import CellFolder
 from cvo_export.cli import app
+from cvo_export.data.noise import parse_noise
+from cvo_export.data.splits import make_split, training_frames
 from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level
-from cvo_export.noise import parse_noise
-from cvo_export.splits import make_split, training_frames
-from cvo_export.study import _plan, expanded, read_study, run_study
-from cvo_export.study_report import page_template, write_report
-from cvo_export.workers import run_tasks
+from cvo_export.study import cells
+from cvo_export.study.cells import CellFolder
+from cvo_export.study.grid import _plan, expanded, read_study, run_study
+from cvo_export.study.report import page_template, write_report
+from cvo_export.study.workers import run_tasks
 
 from .conftest import DATASET, ignore_progress
 
@@ -304,6 +304,6 @@ def test_the_configurations_that_come_with_the_project_can_be(name, cells, reque
     monkeypatch.setenv("CVO_WEIGHTS", "of-another-place")
     study = read_study(request.config.rootpath / "bench" / "study" / f"{name}.toml")
     stand_in = open_dataset("synthetic:room,flights=20,frames=10,size=64x48")
-    monkeypatch.setattr("cvo_export.configure.open_dataset", lambda _: stand_in)
+    monkeypatch.setattr("cvo_export.training.configure.open_dataset", lambda _: stand_in)
     opened = {text: stand_in for grid in study.grids for text in grid.data}
     assert len(_plan(study, opened).configs) == cells

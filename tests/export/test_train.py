@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from cvo_edge.errors import UsageError
-from cvo_export import train as training
-from cvo_export.features import ModelImages
-from cvo_export.run import load_run
-from cvo_export.target import MAX_SPREAD_RAD, fit_target
-from cvo_export.train import train
+from cvo_export.networks.standardised import MAX_SPREAD_RAD, fit_target
+from cvo_export.training import loop as training
+from cvo_export.training.features import ModelImages
+from cvo_export.training.loop import train
+from cvo_export.training.run import load_run
 
 from .conftest import ignore_progress, tiny_config
 

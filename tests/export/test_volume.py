@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from cvo_edge.pose import Ellipsoids
-from cvo_export.volume import ellipsoids_log_volume, union_log_volume
+from cvo_edge.sets import Ellipsoids
+from cvo_export.bundles.volume import ellipsoids_log_volume, union_log_volume
 
 BALL = {2: math.pi, 3: 4.0 / 3.0 * math.pi, 6: math.pi**3 / 6.0}
 

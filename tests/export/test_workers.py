@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from cvo_edge.artifact import read_calibration
+from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.errors import CalibrationFileError, SinkError
-from cvo_export.workers import TaskError, run_tasks
+from cvo_export.study.workers import TaskError, run_tasks
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -73,7 +73,7 @@ def test_no_process_is_left_behind_by_a_signal(tmp_path, number):
         "import signal, sys; from functools import partial\n"
         # What starts the tests may have it ignored.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from cvo_export.workers import run_tasks\n"
+        "from cvo_export.study.workers import run_tasks\n"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))\n"
         f"tasks = {{name: partial(exec, {sleep!r}) for name in 'abc'}}\n"
         "run_tasks(2, tasks, lambda *_: None)"

@@ -9,7 +9,7 @@ from cvo_edge.conformal import (
     conformal_rank,
     hierarchical_quantile,
 )
-from cvo_export.calibrate import Scored, thresholds
+from cvo_export.bundles.thresholds import Scored, thresholds
 
 REPEATS = 1000
 

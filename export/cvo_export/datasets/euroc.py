@@ -21,7 +21,7 @@ import yaml
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.trajectory import matrix_to_pose
+from cvo_edge.ground_truth import matrix_to_pose
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.images import decode_image
+from cvo_edge.input.decoding import decode_image
 from cvo_export.datasets.base import PoseDataset, skipped_text
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.trajectory import nearest_stamp
+from cvo_edge.ground_truth import nearest_stamp
 from cvo_export.datasets.frames import FrameList
 
 Array = NDArray[np.float64]

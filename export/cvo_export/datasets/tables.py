@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.trajectory import seconds_to_ns
+from cvo_edge.ground_truth import seconds_to_ns
 
 Array = NDArray[np.float64]
 

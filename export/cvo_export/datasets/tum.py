@@ -12,7 +12,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from cvo_edge.trajectory import MAX_STAMP_DIFFERENCE_NS
+from cvo_edge.ground_truth import MAX_STAMP_DIFFERENCE_NS
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList

@@ -1,0 +1,1 @@
+"""A bundle on disk: its format, strict reading and writing, rules and signature."""

@@ -1,0 +1,106 @@
+"""The rules between the keys of ``calibration.json`` that no key has alone."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+from cvo_edge.bundle.format import (
+    CONFIDENCES,
+    Calibration,
+    SixOrUnbounded,
+    TensorSpec,
+    Threshold,
+    shown,
+)
+from cvo_edge.errors import CalibrationFileError
+
+
+def check_rules(calibration: Calibration) -> None:
+    """Raise CalibrationFileError, naming key and rule, where keys contradict one another."""
+    pose = calibration.pose
+    given = pose.reference_q_xyzw is not None
+    # An offset about the prediction needs no reference; its plausible limits may.
+    if pose.rotation != "tangent_predicted" and given != (pose.rotation == "tangent_reference"):
+        raise CalibrationFileError(
+            "pose.reference_q_xyzw: expected a quaternion with tangent_reference and null with "
+            f"euler_zyx, found {shown(pose.reference_q_xyzw)} with {pose.rotation}"
+        )
+    if pose.reference_q_xyzw is not None:
+        norm = math.sqrt(sum(component**2 for component in pose.reference_q_xyzw))
+        if abs(norm - 1.0) > 1e-6:
+            raise CalibrationFileError(
+                f"pose.reference_q_xyzw: expected norm 1 within 1e-6, found {norm:.9g}"
+            )
+    for index, (low, high) in enumerate(zip(pose.limits.lowest, pose.limits.highest, strict=True)):
+        if not low < high:
+            raise CalibrationFileError(
+                f"pose.limits: expected lowest < highest, found {low} and {high} at [{index}]"
+            )
+    _check_thresholds(calibration.thresholds)
+    _check_model(calibration)
+
+
+def _check_thresholds(thresholds: tuple[Threshold, ...]) -> None:
+    for scope in ("marginal", "joint"):
+        stored = [entry.confidence for entry in thresholds if entry.scope == scope]
+        missing = [c for c in CONFIDENCES if not any(abs(c - found) < 1e-9 for found in stored)]
+        if missing:
+            raise CalibrationFileError(
+                f"thresholds: expected {', '.join(map(str, CONFIDENCES))} for scope {scope}, "
+                f"found none for {', '.join(map(str, missing))}"
+            )
+        entries = sorted(
+            (entry for entry in thresholds if entry.scope == scope), key=lambda e: e.confidence
+        )
+        for before, after in pairwise(entries):
+            if after.confidence - before.confidence < 1e-9:
+                raise CalibrationFileError(
+                    f"thresholds: expected each confidence once a scope, found "
+                    f"{after.confidence} ({scope}) twice"
+                )
+            for side in ("q_hat", "q_hat_upper"):
+                _check_monotone(getattr(before, side), getattr(after, side), side, after, scope)
+
+
+def _check_monotone(
+    smaller: SixOrUnbounded | None,
+    larger: SixOrUnbounded | None,
+    side: str,
+    entry: Threshold,
+    scope: str,
+) -> None:
+    if smaller is None or larger is None:
+        if smaller is not larger:
+            raise CalibrationFileError(f"thresholds.{side}: expected null for all or for none")
+        return
+    for index, (low, high) in enumerate(zip(smaller, larger, strict=True)):
+        # None is unbounded, the largest of all.
+        if high is not None and (low is None or low > high):
+            raise CalibrationFileError(
+                f"thresholds.{side}: expected growth with the confidence, found {low} before "
+                f"{high} at [{index}], confidence {entry.confidence}, {scope}"
+            )
+
+
+def _check_model(calibration: Calibration) -> None:
+    model, preprocess = calibration.model, calibration.preprocess
+    image = TensorSpec(
+        name="image", dtype="uint8", shape=(1, preprocess.height, preprocess.width, 3)
+    )
+    if image not in model.inputs:
+        raise CalibrationFileError(
+            f"model.inputs: expected image uint8 {list(image.shape)} (from preprocess), found "
+            + shown([(spec.name, spec.dtype, list(spec.shape)) for spec in model.inputs])
+        )
+    for tensors in (model.inputs, model.outputs):
+        names = [spec.name for spec in tensors]
+        if len(set(names)) != len(names):
+            raise CalibrationFileError(f"model: expected each tensor once, found {shown(names)}")
+    sizes = {spec.name: math.prod(spec.shape) for spec in model.outputs}
+    given = {name: len(values) for name, values in calibration.selftest.outputs.items()}
+    if sizes != given:
+        raise CalibrationFileError(
+            f"selftest.outputs: expected one value per element of model.outputs {shown(sizes)}, "
+            f"found {shown(given)}"
+        )

@@ -1,0 +1,80 @@
+"""The only file that knows OpenVINO, the provider of bundles that were calibrated on it.
+
+Faster than onnxruntime in 8 bits on some processors (``docs/performance.md``), and never with the
+thresholds of the other: their 8-bit numbers differ.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.bundle.format import ModelSpec
+from cvo_edge.cores import checked_threads
+from cvo_edge.engine.session import Session, one_line
+from cvo_edge.errors import ModelError
+
+
+class OpenvinoSession(Session):
+    """One loaded model; parameters, attributes and errors as ``Session`` has them.
+
+    ``at_once`` is the number of threads that call it at the same time, each with ``threads`` of its
+    own.
+    """
+
+    def __init__(
+        self, model: bytes, threads: int | None, expected: ModelSpec, *, at_once: int = 1
+    ) -> None:
+        try:
+            from openvino import Core, Type
+        # Of an older release, or of what is left of one, whatever it happens to raise.
+        except Exception as error:
+            raise ModelError(
+                "model.provider: expected the package openvino, 2026.4 or newer, found "
+                f'{one_line(error)}; pip install "cvo-edge[openvino]"'
+            ) from None
+        # It reads what a model names as external data, from whatever folder the process is in; a
+        # session of onnxruntime refuses such a model.
+        Session(model, 1, expected)
+        self.threads = checked_threads(threads)
+        settings = {
+            "PERFORMANCE_HINT": "LATENCY" if at_once == 1 else "THROUGHPUT",
+            "NUM_STREAMS": at_once,
+            "INFERENCE_NUM_THREADS": self.threads * at_once,
+            # Left to itself it computes in bfloat16 where the processor can.
+            "INFERENCE_PRECISION_HINT": Type.f32,
+        }
+        try:
+            core = Core()
+            self.engine = core.compile_model(core.read_model(model=model), "CPU", settings)
+            precision = self.engine.get_property("INFERENCE_PRECISION_HINT")
+        # Every failure is a RuntimeError there, of many lines; what it is about follows the places.
+        except Exception as error:
+            summary = str(error).rpartition("Summary:")[2]
+            raise ModelError(f"model.onnx: refused by OpenVINO: {one_line(summary)}") from None
+        if precision != Type.f32:
+            raise ModelError(f"model.onnx: expected OpenVINO to compute in f32, found {precision}")
+        self._declare(_ports(self.engine.inputs), _ports(self.engine.outputs), expected)
+        self._requests = threading.local()
+
+    def _call(self, feeds: Mapping[str, NDArray[np.generic]]) -> Sequence[Any]:
+        # A request serves one call at a time.
+        if not hasattr(self._requests, "own"):
+            self._requests.own = self.engine.create_infer_request()
+        found = self._requests.own.infer(feeds, share_inputs=True)
+        return [found[name] for name in self._names]
+
+
+def _ports(ports: Sequence[Any]) -> list[tuple[str, str, list[Any]]]:
+    return [
+        (
+            port.any_name,
+            port.get_element_type().get_type_name(),
+            [size.get_length() if size.is_static else str(size) for size in port.partial_shape],
+        )
+        for port in ports
+    ]

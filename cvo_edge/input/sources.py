@@ -1,0 +1,362 @@
+"""Where frames come from: a folder or glob of images, a video file, a camera."""
+
+from __future__ import annotations
+
+import glob
+import logging
+import math
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from threading import Event
+from time import perf_counter
+from typing import TypeVar
+
+from cvo_edge.errors import SourceError, UsageError, printable
+from cvo_edge.files import read_regular_file
+from cvo_edge.input.capture import TIMEOUT_S, Capture, shown
+from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image, is_image
+from cvo_edge.input.frame import Frame, Source
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
+# Videos that begin as an image does.
+_JPEGS_IN_A_ROW = (".mjpg", ".mjpeg")
+
+# Stamps are nanoseconds in 64 bits, also after years.
+LOWEST_FPS, HIGHEST_FPS = 1e-3, 1e6
+LONGEST_S = 3600.0
+
+# Before each new attempt to open a camera: eight seconds in all.
+PAUSES_S = (0.25, 0.5, 1.0, 2.0, 4.0)
+
+_LOG = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+
+def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_S) -> Source:
+    """Guess from what ``text`` is: a folder, a glob, a video file, a camera or a stream.
+
+    Parameters
+    ----------
+    text
+        Folder of images (natural order; only ``*.color.*`` where there are any, never
+        ``*.depth.*``, nor hidden files), a glob pattern, a video file, a camera index such as
+        ``0``, a device path such as ``/dev/video0``, a named pipe, or the address of a stream such
+        as ``rtsp://...``.
+    fps
+        Frames per second to stamp frames with, starting at zero, instead of the source's own.
+    timeout_s
+        How long to wait for the next frame of a video or camera, twice that for it to open.
+
+    Raises
+    ------
+    SourceError
+        There is no such source, or no image in it.
+    UsageError
+        ``fps`` or ``timeout_s`` is out of range.
+    """
+    if fps is not None and not LOWEST_FPS <= fps <= HIGHEST_FPS:
+        raise UsageError(f"fps: expected {LOWEST_FPS:g} to {HIGHEST_FPS:g}, found {fps:g}")
+    if not 0.0 < timeout_s <= LONGEST_S:
+        raise UsageError(f"timeout: expected up to {LONGEST_S:g} s, found {timeout_s:g}")
+    path = Path(text)
+    try:
+        path.exists()
+    except OSError as error:
+        raise SourceError(f"{shown(text)}: cannot be looked for: {error.strerror}") from None
+    if path.is_dir():
+        return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
+    if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
+        raise SourceError(f"{shown(text)}: expected a file's path, found an address of one")
+    if names_camera(text):
+        return Camera(int(text) if text.isdecimal() else text, fps, timeout_s)
+    if path.is_file():
+        if path.suffix.lower() in IMAGE_SUFFIXES or _is_one_image(path):
+            return ImageFiles([path], fps, "")
+        return Video(path, fps, timeout_s)
+    if glob.has_magic(text):
+        found = [Path(name) for name in glob.glob(text, recursive=True) if Path(name).is_file()]
+        return ImageFiles(
+            _colour_images(found), fps, f"{shown(text)}: expected images, found no match"
+        )
+    raise SourceError(
+        f"{shown(text)}: expected a folder, glob, video file, camera index or device, found none "
+        "of these"
+    )
+
+
+def names_camera(text: str) -> bool:
+    """Whether frames come by themselves there: an index, a device, a named pipe or an address."""
+    path = Path(text)
+    if path.is_dir():
+        return False
+    return text.isdecimal() or path.is_char_device() or path.is_fifo() or "://" in text
+
+
+def natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key that reads digits as numbers: ``frame-2`` before ``frame-10``."""
+    parts = re.split("([0-9]+)", str(path))
+    return [
+        (1, 0, part) if index % 2 == 0 else (0, int(part), "")
+        for index, part in enumerate(parts)
+        if part
+    ]
+
+
+class ImageFiles:
+    """Image files in the given order; an unreadable one costs that frame only."""
+
+    live = False
+
+    def __init__(self, paths: list[Path], fps: float | None, if_empty: str) -> None:
+        if not paths:
+            raise SourceError(if_empty)
+        self._paths = paths
+        self._fps = fps
+        self.length: int | None = len(paths)
+
+    def reads(self) -> Iterator[Callable[[], Frame]]:
+        """Yield one call a file."""
+        for seq, path in enumerate(self._paths):
+            yield partial(_read_file, path, _stamp(seq, self._fps))
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield one frame a file."""
+        for read in self.reads():
+            yield read()
+
+
+class Video:
+    """A video file. Stamps are its container's, from the first frame on, unless ``fps`` is given.
+
+    Of a frame that does not decode, and has others behind it, there is no image.
+    """
+
+    live = False
+
+    # So many in a row are an end, also where no number of frames is announced.
+    _UNREADABLE_IN_A_ROW = 100
+
+    def __init__(self, path: Path, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
+        self._path = path
+        self._capture = Capture(str(path), timeout_s)
+        own_fps, announced = self._capture.open()
+        self._stamps = _VideoStamps(fps, own_fps)
+        self.length: int | None = announced if announced > 0 else None
+
+    def reads(self) -> Iterator[Callable[[], Frame]]:
+        """Yield the frames, read: one comes after the other."""
+        for frame in self:
+            yield partial(_itself, frame)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames; raises SourceError where the file ends before its own count."""
+        seq = unreadable = 0
+        with closing(self._capture):
+            while unreadable < self._UNREADABLE_IN_A_ROW:
+                if (grabbed := self._capture.read()) is None:
+                    unreadable += 1
+                    continue
+                found = [*[(None, 0.0)] * unreadable, (grabbed.image, grabbed.read_ms)]
+                stamps = self._stamps.next(len(found), grabbed.position_ms)
+                for (image, read_ms), stamp_ns in zip(found, stamps, strict=True):
+                    yield Frame(image, stamp_ns, f"{shown(self._path.name)}#{seq}", read_ms)
+                    seq += 1
+                unreadable = 0
+        if self.length is not None and seq < self.length:
+            raise SourceError(
+                f"{self._path}: expected {self.length} frames, as its header says or its duration "
+                f"gives, found it ended early: {seq} of {self.length}"
+            )
+
+
+class _VideoStamps:
+    """Where a container puts its frames, in ns from the first one, unless a rate is given.
+
+    A frame that a decoder leaves out does not shift the ones behind it, and a phone's frames are
+    not one as long as the other. A container without times has those of its own rate.
+    """
+
+    # Nanoseconds in a record are of 64 bits.
+    _END_NS = 2.0**62
+
+    def __init__(self, fps: float | None, own_fps: float) -> None:
+        self._fps = fps
+        believable = LOWEST_FPS <= own_fps <= HIGHEST_FPS
+        self._gap_ns = 1e9 / own_fps if believable else None
+        self._seq, self._has_times = 0, False
+        self._origin_ms, self._last_ns = math.nan, 0.0
+
+    def next(self, count: int, position_ms: float) -> list[int | None]:
+        """Stamps of the next ``count`` frames, the last of which is at ``position_ms``.
+
+        Those before it, unreadable ones, are put evenly between.
+        """
+        begin, self._seq = self._seq, self._seq + count
+        if self._fps is not None:
+            return [_stamp(seq, self._fps) for seq in range(begin, self._seq)]
+        if self._gap_ns is None:
+            return [None] * count
+        last_ns = self._last_ns
+        if begin == 0:
+            last_ns = -self._gap_ns
+            self._origin_ms = position_ms - 1e-6 * self._gap_ns * (count - 1)
+        now_ns = 1e6 * (position_ms - self._origin_ms)
+        if last_ns < now_ns < self._END_NS:
+            self._has_times = begin > 0
+        else:
+            # Half a frame where others have times, so that the next one's is a later one again.
+            now_ns = last_ns + self._gap_ns * (0.5 if self._has_times else count)
+        self._last_ns = now_ns
+        return [round(last_ns + (now_ns - last_ns) * (k + 1) / count) for k in range(count)]
+
+
+class Camera:
+    """A camera by index, device path or address; stamps are the clock's when a frame arrived.
+
+    One that does not open, or gives no frame for ``timeout_s``, is given up and opened again, a few
+    times, after ever longer pauses. A frame that does not decode has no image.
+
+    Its frames are to be taken as they come, as ``Odometer.stream`` does in every mode: what nobody
+    takes lies in queues of drivers.
+    """
+
+    live = True
+
+    # So many in a row are an end.
+    _UNREADABLE_IN_A_ROW = 5
+
+    def __init__(self, device: int | str, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
+        self._device, self._fps, self._timeout_s = device, fps, timeout_s
+        self._capture: Capture | None = None
+        self._failures = self._since_opened = 0
+        self._stopped = Event()
+        self.length: int | None = None
+        self._insisting(self._opened)
+
+    def reads(self) -> Iterator[Callable[[], Frame]]:
+        """Yield the frames, read: one comes after the other."""
+        for frame in self:
+            yield partial(_itself, frame)
+
+    def stop(self) -> None:
+        """End the frames, whoever is waiting for the next one."""
+        self._stopped.set()
+        self._close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames until ``stop``; raises SourceError where none comes, opened anew or not."""
+        seq = 0
+        try:
+            while not self._stopped.is_set():
+                frames = self._insisting(self._next)
+                if frames is None:
+                    return
+                self._since_opened += 1
+                if self._since_opened > 1:
+                    # One frame a connection is what an address of single pictures gives.
+                    self._failures = 0
+                for frame in frames:
+                    stamp_ns = _stamp(seq, self._fps) if self._fps else frame.stamp_ns
+                    yield replace(frame, stamp_ns=stamp_ns, source=f"{shown(self._device)}#{seq}")
+                    seq += 1
+        finally:
+            self._close()
+
+    def _opened(self) -> Capture:
+        capture = self._capture
+        if capture is None:
+            # Known before it is waited for, so that ``stop`` finds it.
+            capture = self._capture = Capture(self._device, self._timeout_s)
+            self._since_opened = 0
+            if self._stopped.is_set():
+                self._close()
+            capture.open()
+        return capture
+
+    def _next(self) -> list[Frame] | None:
+        """The next frame that decodes, behind those that do not; None at the end."""
+        frames: list[Frame] = []
+        capture, late = self._opened(), time.monotonic() + self._timeout_s
+        while len(frames) < self._UNREADABLE_IN_A_ROW and time.monotonic() < late:
+            if (grabbed := capture.read()) is not None:
+                read_ms, queued_ms = grabbed.decode_ms, grabbed.queued_ms
+                return [*frames, Frame(grabbed.image, grabbed.stamp_ns, "", read_ms, queued_ms)]
+            frames.append(Frame(None, time.time_ns(), "", 0.0))
+        return None
+
+    def _close(self) -> None:
+        capture, self._capture = self._capture, None
+        if capture is not None:
+            capture.close()
+
+    def _insisting(self, call: Callable[[], T | None]) -> T | None:
+        """What a call gives at last; nothing and a SourceError are failures. None once stopped."""
+        while not self._stopped.is_set():
+            try:
+                found = call()
+            except SourceError as error:
+                problem = str(error)
+            else:
+                if found is not None:
+                    return found
+                problem = f"{shown(self._device)}: expected a frame, found its end"
+            self._close()
+            if self._stopped.is_set():
+                break
+            if self._failures == len(PAUSES_S):
+                raise SourceError(f"{problem}, and again {self._failures} times")
+            pause_s = PAUSES_S[self._failures]
+            _LOG.warning("%s; opening it again in %g s", printable(problem), pause_s)
+            self._stopped.wait(pause_s)
+            self._failures += 1
+        return None
+
+
+def _read_file(path: Path, stamp_ns: int | None) -> Frame:
+    start = perf_counter()
+    try:
+        content = read_regular_file(path, MAX_IMAGE_BYTES, SourceError, links=True)
+        image = decode_image(content)
+    except SourceError:
+        image = None
+    spent = 1e3 * (perf_counter() - start)
+    return Frame(image, stamp_ns, shown(path.name), spent)
+
+
+def _itself(frame: Frame) -> Frame:
+    return frame
+
+
+def _is_one_image(path: Path) -> bool:
+    """Whether a file without an image's ending is one: no video, of which FFmpeg would take it."""
+    if path.suffix.lower() in _JPEGS_IN_A_ROW:
+        return False
+    try:
+        with path.open("rb") as stream:
+            return is_image(stream.read(16))
+    except OSError:
+        return False
+
+
+def _images_in(folder: Path) -> list[Path]:
+    # Hidden ones are not pictures: macOS leaves them beside each file on a card.
+    return _colour_images(
+        [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    )
+
+
+def _colour_images(paths: list[Path]) -> list[Path]:
+    images = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [path for path in images if ".depth." not in path.name]
+    colour = [path for path in images if ".color." in path.name]
+    return sorted(colour or images, key=natural_key)
+
+
+def _stamp(seq: int, fps: float | None) -> int | None:
+    return None if fps is None else round(seq * 1_000_000_000 / fps)

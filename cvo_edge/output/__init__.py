@@ -1,0 +1,1 @@
+"""Where estimates go: sinks, and reading recorded files back."""

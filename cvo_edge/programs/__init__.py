@@ -1,0 +1,1 @@
+"""The commands of ``cvo-edge``: one file a command, and what they measure."""

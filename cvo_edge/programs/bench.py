@@ -1,0 +1,311 @@
+"""What a bundle costs on this machine, beside the bare inference call in the same run."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain, islice
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+
+from cvo_edge.engine.model_cache import ModelCache
+from cvo_edge.engine.session import Session
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.estimate import PoseInterval
+from cvo_edge.input import preprocess
+from cvo_edge.input.capture import shown
+from cvo_edge.input.frame import Frame
+from cvo_edge.input.sources import names_camera, open_source
+from cvo_edge.odometer import Odometer
+from cvo_edge.programs.measure import (
+    LatencyProfile,
+    environment,
+    memory_mib,
+    quantiles,
+    waited_for_cores_s,
+)
+from cvo_edge.scheduling import AHEAD, Mode
+from cvo_edge.sets import Scope
+
+# A common camera's frame, used where no source is given, and its rate.
+_DEFAULT_HEIGHT, _DEFAULT_WIDTH = 480, 640
+_LIVE_FPS = 30
+# A stream and bare calls take turns so often.
+_ROUNDS = 5
+# Of a frame's time; below it other processes do not matter.
+_BUSY_SHARE = 0.05
+
+
+@dataclass
+class _Found:
+    """What the frames that count have cost; one ratio a step, or a round of a stream."""
+
+    raw_ms: list[float] = field(default_factory=list)
+    ratios: list[float] = field(default_factory=list)
+    latency: LatencyProfile = field(default_factory=LatencyProfile)
+    valid: int = 0
+    skipped: int = 0
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    # From the first to the last of them, bare calls included.
+    all_s: float = 0.0
+    waited_s: float = 0.0
+
+
+def benchmark(
+    bundle: Path,
+    source: str | None = None,
+    *,
+    frames: int = 200,
+    warmup: int = 20,
+    mode: Mode | str = Mode.LATENCY,
+    threads: int | None = None,
+    confidence: float = 0.9,
+    scope: Scope = "marginal",
+    cache: ModelCache | None = None,
+) -> dict[str, Any]:
+    """Time ``frames`` frames in a mode, beside bare inference calls on the same model.
+
+    The two take turns, so that a change of the machine's speed meets both: in mode ``latency`` a
+    step and a call, in the others a fifth of the frames as a stream and as many calls.
+    ``ratio_to_raw`` is the median of one over the other, of the step without reading, in
+    ``throughput`` the time a frame, in ``live`` the age of a frame at its interval. Files are read
+    again and again, in ``live`` at 30 frames a second. Without a source a still synthetic image is
+    used; its pose may be implausible, and then the conformal step is not run; ``frames_valid``
+    counts those where it was. Invalid frames of a source are not timed. Returns the report of
+    ``cvo-edge bench --json``.
+
+    Raises UsageError for counts below one, SourceError where the source gives no valid frame, and
+    what ``Odometer.load`` raises.
+    """
+    if frames < 1 or warmup < 0:
+        raise UsageError(
+            f"bench: expected frames >= 1 and warmup >= 0, found {frames} and {warmup}"
+        )
+    start = perf_counter()
+    odometer = Odometer.load(
+        bundle, threads=threads, mode=mode, confidence=confidence, scope=scope, cache=cache
+    )
+    load_ms = 1e3 * (perf_counter() - start)
+    session = odometer.session
+    if session is None:  # pragma: no cover - just loaded
+        raise UsageError("bench: expected an open odometer")
+    stream = _Endless(source)
+    first = next(iter(stream))
+    odometer.step(first.image)
+    first_interval_ms = _process_age_ms()
+    measure = _steps if odometer.mode is Mode.LATENCY else _streams
+    found = measure(odometer, session, stream, frames, warmup)
+    if not found.latency.count:
+        raise SourceError(
+            f"{shown(source or 'image')}: expected at least one valid frame, found none in {frames}"
+        )
+    counted = found.latency.count
+    return {
+        "bundle": odometer.calibration.name,
+        "method": odometer.calibration.method,
+        "precision": odometer.calibration.model.precision,
+        "provider": odometer.calibration.model.provider,
+        "mode": odometer.mode,
+        "frames": frames,
+        "frames_valid": found.valid,
+        "frames_skipped": found.skipped,
+        "warmup": warmup,
+        "latency_ms": found.latency.summary(),
+        "raw_model_ms": quantiles(found.raw_ms),
+        "ratio_to_raw": {"median": round(float(np.median(found.ratios)), 4)},
+        "throughput_fps": round(counted / found.wall_s, 1),
+        "load_ms": round(load_ms, 1),
+        "first_interval_ms": round(first_interval_ms, 1),
+        "cpu_ms_per_frame": round(1e3 * found.cpu_s / counted, 3),
+        "waited_for_cores": round(found.waited_s / (odometer.threads * found.all_s), 4),
+        "memory_mib": memory_mib(),
+        "environment": environment(odometer.threads),
+    }
+
+
+def _steps(
+    odometer: Odometer, session: Session, stream: _Endless, frames: int, warmup: int
+) -> _Found:
+    """One step, one bare call on the same image, and so on."""
+    found = _Found()
+    spec = odometer.calibration.preprocess
+    feeds = _blank_feeds(odometer)
+    all_begin, waited_s = perf_counter(), waited_for_cores_s()
+    for count, frame in enumerate(islice(stream, warmup + frames)):
+        image = preprocess.to_bgr8(frame.image)
+        if image is not None:
+            feeds["image"] = preprocess.model_input(image, spec.height, spec.width, spec.crop)
+        raw_ms = _raw_ms(session, feeds) if count % 2 else 0.0
+        cpu_begin, begin = process_time(), perf_counter()
+        estimate = odometer.step(frame.image, frame.stamp_ns, frame.source, frame.read_ms)
+        spent_s, cpu_s = perf_counter() - begin, process_time() - cpu_begin
+        if not count % 2:  # whoever comes second finds warmer caches
+            raw_ms = _raw_ms(session, feeds)
+        if count >= warmup and _counts(estimate, stream):
+            found.valid += estimate.pose is not None
+            found.latency.add(estimate.latency_ms)
+            found.raw_ms.append(raw_ms)
+            found.ratios.append(1e3 * spent_s / raw_ms)
+            found.wall_s += spent_s + 1e-3 * frame.read_ms
+            found.cpu_s += cpu_s
+    found.all_s = perf_counter() - all_begin
+    found.waited_s = waited_for_cores_s() - waited_s
+    return found
+
+
+def _streams(
+    odometer: Odometer, session: Session, stream: _Endless, frames: int, warmup: int
+) -> _Found:
+    """A part of the frames as a stream, as many bare calls, and so on."""
+    found = _Found()
+    feeds = _blank_feeds(odometer)
+    live = odometer.mode is Mode.LIVE
+    with closing(odometer.stream(stream)) as estimates:
+        for _ in islice(estimates, warmup):
+            pass
+        all_begin, waited_s = perf_counter(), waited_for_cores_s()
+        for part in np.array_split(np.arange(frames), min(_ROUNDS, frames)):
+            # What came while bare calls were timed, or lies ready since.
+            lying = islice(estimates, odometer.threads + AHEAD)
+            before = [estimate.seq for estimate in lying][-1]
+            ages_ms = []
+            cpu_begin, begin = process_time(), perf_counter()
+            for estimate in islice(estimates, len(part)):
+                found.skipped += estimate.seq - before - 1
+                before = estimate.seq
+                if _counts(estimate, stream):
+                    found.valid += estimate.pose is not None
+                    found.latency.add(estimate.latency_ms)
+                    ages_ms.append(estimate.latency_ms["total"])
+            spent_s, cpu_s = perf_counter() - begin, process_time() - cpu_begin
+            raw_ms = [_raw_ms(session, feeds) for _ in part]
+            found.raw_ms += raw_ms
+            found.wall_s += spent_s
+            found.cpu_s += cpu_s
+            if ages_ms:
+                whole_ms = float(np.median(ages_ms)) if live else 1e3 * spent_s / len(ages_ms)
+                found.ratios.append(whole_ms / float(np.median(raw_ms)))
+        # Here, while the workers whose waiting counts are there.
+        found.all_s = perf_counter() - all_begin
+        found.waited_s = waited_for_cores_s() - waited_s
+    return found
+
+
+def _counts(estimate: PoseInterval, stream: _Endless) -> bool:
+    """An invalid frame is quick: it must not flatter the figures of a real source."""
+    return stream.still or estimate.pose is not None
+
+
+def _blank_feeds(odometer: Odometer) -> dict[str, Any]:
+    spec = odometer.calibration.preprocess
+    image = np.zeros((1, spec.height, spec.width, 3), np.uint8)
+    return {"image": image, **odometer.head.extra_inputs(0)}
+
+
+def benchmark_lines(report: dict[str, Any]) -> list[str]:
+    """Return the report as lines of text for a person."""
+    header = f"{'ms':<12}" + "".join(f"{name:>9}" for name in ("p50", "p90", "p95", "p99", "mean"))
+    rows = {**report["latency_ms"], "bare model": report["raw_model_ms"]}
+    where = report["environment"]
+    return [
+        f"{report['bundle']} ({report['method']}, {report['precision']} on {report['provider']}), "
+        f"mode {report['mode']}: {report['frames']} frames after {report['warmup']} warm-up, "
+        f"{where['threads']} threads on {where['cpu']}",
+        header,
+        *(f"{k:<12}" + "".join(f"{v:>9.3f}" for v in row.values()) for k, row in rows.items()),
+        f"{_RATIOS[report['mode']]} over the bare model call: "
+        f"{report['ratio_to_raw']['median']:.3f}",
+        f"{report['throughput_fps']:.0f} frames/s, {report['cpu_ms_per_frame']:.2f} CPU-ms a "
+        f"frame, load {report['load_ms']:.0f} ms, first interval "
+        f"{report['first_interval_ms']:.0f} ms after process start",
+        *_remarks(report),
+        "memory MiB: " + ", ".join(f"{k} {v:.0f}" for k, v in report["memory_mib"].items()),
+    ]
+
+
+_RATIOS = {
+    Mode.LATENCY: "array to interval",
+    Mode.THROUGHPUT: "time a frame",
+    Mode.LIVE: "age of a frame at its interval",
+}
+
+
+def _raw_ms(session: Session, feeds: dict[str, Any]) -> float:
+    begin = perf_counter()
+    session.run(feeds)
+    return 1e3 * (perf_counter() - begin)
+
+
+def _remarks(report: dict[str, Any]) -> list[str]:
+    remarks = []
+    if report["frames_skipped"]:
+        remarks.append(f"{report['frames_skipped']} frames skipped for newer ones")
+    if report["frames_valid"] < report["frames"]:
+        remarks.append(
+            f"{report['frames_valid']} of {report['frames']} frames gave a plausible pose; a "
+            "SOURCE of the scene times the conformal step on every frame"
+        )
+    if report["waited_for_cores"] > _BUSY_SHARE:
+        remarks.append(
+            f"busy machine: {report['waited_for_cores']:.0%} of the time was spent waiting for a "
+            "core that others had; beside them fewer --threads may be faster"
+        )
+    return remarks
+
+
+class _Endless:
+    """A source again and again, as one; without one a still image."""
+
+    length = None
+
+    def __init__(self, source: str | None) -> None:
+        self.still = source is None
+        self._source = source
+        self.live = source is not None and names_camera(source)
+        # Whoever asks again goes on: many a camera serves one client, once.
+        self._numbered = enumerate(self._again())
+
+    def reads(self) -> Iterator[Callable[[], Frame]]:
+        """Yield a call for each frame; those of files have the stamps of a steady camera."""
+        for seq, read in self._numbered:
+            yield read if self.live else partial(_stamped, read, round(seq * 1e9 / _LIVE_FPS))
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames."""
+        for read in self.reads():
+            yield read()
+
+    def _again(self) -> Iterator[Callable[[], Frame]]:
+        if self._source is None:
+            image = preprocess.selftest_image(_DEFAULT_HEIGHT, _DEFAULT_WIDTH)
+            still = Frame(image, None, "", 0.0)
+            while True:
+                yield lambda: still
+        while True:
+            reads = open_source(self._source).reads()
+            first = next(reads, None)
+            if first is None:
+                raise SourceError(f"{shown(self._source)}: expected frames, found none")
+            yield from chain([first], reads)
+
+
+def _stamped(read: Callable[[], Frame], stamp_ns: int) -> Frame:
+    return replace(read(), stamp_ns=stamp_ns)
+
+
+def _process_age_ms() -> float:
+    """Milliseconds since this process started, by the kernel's clock (0 where unknown)."""
+    try:
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        uptime = time.clock_gettime(time.CLOCK_BOOTTIME)
+        return 1e3 * (uptime - int(fields[19]) / os.sysconf("SC_CLK_TCK"))
+    except (OSError, AttributeError, ValueError):
+        return 0.0

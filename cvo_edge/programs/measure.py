@@ -1,0 +1,134 @@
+"""What it costs and where it ran: latency quantiles a stage, memory, environment."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import resource
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cvo_edge.cores import allowed_cores
+
+STAGES = ("read", "preprocess", "model", "conformal", "total")
+
+
+class LatencyProfile:
+    """Latencies per stage in bounded memory: the first frames exactly, then the latest.
+
+    A ring of ``capacity`` values a stage: quantiles of a week-long run are those of its last
+    frames, and memory stays flat.
+    """
+
+    def __init__(self, stages: Iterable[str] = STAGES, capacity: int = 100_000) -> None:
+        self._values = {stage: np.empty(min(capacity, 1024), np.float32) for stage in stages}
+        self._capacity = capacity
+        self.count = 0
+
+    def add(self, latency_ms: Mapping[str, float]) -> None:
+        """Record one frame's milliseconds by stage."""
+        index = self.count % self._capacity
+        for stage, values in self._values.items():
+            if index >= values.size:
+                size = min(self._capacity, 2 * values.size)
+                values = np.resize(values, size)
+                self._values[stage] = values
+            values[index] = latency_ms[stage]
+        self.count += 1
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Stage -> p50, p90, p95, p99 and mean in milliseconds; empty without a frame."""
+        kept = min(self.count, self._capacity)
+        return {stage: quantiles(values[:kept]) for stage, values in self._values.items() if kept}
+
+
+def quantiles(values_ms: ArrayLike) -> dict[str, float]:
+    """p50, p90, p95, p99 and mean of milliseconds, rounded to 0.1 us."""
+    values = np.asarray(values_ms, dtype=np.float64)
+    found = {f"p{q}": float(np.percentile(values, q)) for q in (50, 90, 95, 99)}
+    found["mean"] = float(values.mean())
+    return {name: round(value, 4) for name, value in found.items()}
+
+
+def memory_mib() -> dict[str, float]:
+    """Peak and present resident memory and its anonymous part, MiB (0 where unknown)."""
+    kib = {"VmHWM": 0.0, "VmRSS": 0.0, "RssAnon": 0.0}
+    try:
+        for line in Path("/proc/self/status").read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name in kib:
+                kib[name] = float(value.split()[0])
+    except OSError:
+        # No /proc: the peak alone, in KiB on Linux and bytes on macOS.
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        kib["VmHWM"] = peak / 1024 if sys.platform == "darwin" else peak
+    return {
+        "peak_rss": round(kib["VmHWM"] / 1024, 1),
+        "rss": round(kib["VmRSS"] / 1024, 1),
+        "anonymous": round(kib["RssAnon"] / 1024, 1),
+    }
+
+
+def waited_for_cores_s() -> float:
+    """Seconds that threads of this process have been ready to run and had no core (0 if unknown).
+
+    Of the threads that there are now; what others on the machine take shows here.
+    """
+    waited_ns = 0
+    for path in Path("/proc/self/task").glob("*/schedstat"):
+        # A thread may have ended in between.
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            waited_ns += int(path.read_text().split()[1])
+    return 1e-9 * waited_ns
+
+
+def environment(threads: int | None = None) -> dict[str, Any]:
+    """Return what a reader needs to judge a latency: processor, cores, versions, governor."""
+    # Not for every start of a program that is not asked for it.
+    import importlib.metadata
+
+    versions = {"python": platform.python_version()}
+    for package in ("cvo-edge", "numpy", "onnxruntime", "opencv-python-headless", "msgspec"):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "unknown"
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        versions["openvino"] = importlib.metadata.version("openvino")
+    governor = _first_line(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor"))
+    return {
+        "cpu": _cpu_name(),
+        "architecture": platform.machine(),
+        "system": f"{platform.system()} {platform.release()}",
+        "cores_present": os.cpu_count(),
+        "cores_allowed": allowed_cores(),
+        "threads": threads,
+        "governor": governor,
+        "load_average": list(os.getloadavg()),
+        "memory_available_mib": os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") >> 20,
+        "versions": versions,
+    }
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() in ("model name", "Model", "Hardware"):
+                return value.strip()
+    except OSError:
+        pass
+    return platform.processor() or "unknown"
+
+
+def _first_line(path: Path) -> str | None:
+    try:
+        return path.read_text().splitlines()[0].strip()
+    except (OSError, IndexError):
+        return None

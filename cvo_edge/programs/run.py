@@ -1,0 +1,126 @@
+"""A whole run: every frame of a source through the odometer into a sink, and its summary."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.estimate import PoseInterval, Status
+from cvo_edge.ground_truth import GroundTruth
+from cvo_edge.input.frame import Source
+from cvo_edge.odometer import Odometer
+from cvo_edge.programs.measure import LatencyProfile, memory_mib
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class RunSummary:
+    """Counts, latencies and, with ground truth, coverage: running sums, flat in memory.
+
+    Widths are the means over bounded frames, without the gaps of a set that has some; ``disjoint``
+    counts frames with a gap in some degree of freedom; ``skipped`` those that were left out for a
+    newer one; ``covered`` and ``compared`` count frames whose true pose is known and that have a
+    pose.
+    """
+
+    dof: tuple[str, ...]
+    confidence: float
+    scope: str
+    with_truth: bool = False
+    statuses: Counter[str] = field(default_factory=Counter)
+    reasons: Counter[str] = field(default_factory=Counter)
+    latency: LatencyProfile = field(default_factory=LatencyProfile)
+    bounded: int = 0
+    disjoint: int = 0
+    skipped: int = 0
+    width_sum: Array = field(default_factory=lambda: np.zeros(6))
+    compared: int = 0
+    covered: Array = field(default_factory=lambda: np.zeros(6))
+    covered_jointly: int = 0
+    # An odometer numbers its frames from 0: also the first ones may have been left out.
+    _last_seq: int = -1
+
+    def add(self, estimate: PoseInterval, truth: Array | None) -> None:
+        """Count one estimate; ``truth`` is its true pose (7,) where it is known."""
+        self.skipped += estimate.seq - self._last_seq - 1
+        self._last_seq = estimate.seq
+        self.statuses[estimate.status] += 1
+        self.reasons.update(estimate.reasons)
+        self.latency.add(estimate.latency_ms)
+        if estimate.bounded:
+            self.bounded += 1
+            self.width_sum += estimate.region.width()
+            self.disjoint += any(len(row) > 1 for row in estimate.bands or ())
+        if truth is not None and estimate.pose is not None:
+            self.compared += 1
+            self.covered += estimate.covers(truth)
+            self.covered_jointly += estimate.contains(truth)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames seen."""
+        return self.statuses.total()
+
+    def lines(self) -> list[str]:
+        """Return the summary as lines of text for a person."""
+        counts = ", ".join(f"{self.statuses[status]} {status}" for status in Status)
+        lines = [f"frames      {self.frames}: {counts}; {self.bounded} with finite bounds"]
+        if self.skipped:
+            lines.append(f"skipped     {self.skipped} frames, for newer ones")
+        if self.disjoint:
+            lines.append(f"bands       {self.disjoint} frames with a set in more than one piece")
+        if self.reasons:
+            found = ", ".join(f"{name} {count}" for name, count in sorted(self.reasons.items()))
+            lines.append(f"remarks     {found}")
+        latency = self.latency.summary()
+        if latency:
+            total, model = latency["total"], latency["model"]
+            lines.append(
+                f"latency ms  total p50 {total['p50']:.2f}  p95 {total['p95']:.2f}  "
+                f"p99 {total['p99']:.2f}; model p50 {model['p50']:.2f}"
+            )
+        lines.append(f"memory MiB  peak {memory_mib()['peak_rss']:.0f}")
+        width = self.width_sum / max(1, self.bounded)
+        # Metres and radians become the centimetres and degrees that people think in.
+        shown = np.concatenate([width[:3] * 100, np.rad2deg(width[3:])])
+        units = ["cm"] * 3 + ["deg"] * 3
+        lines.append(f"at {self.confidence:g} {self.scope}" + "".join(f"{n:>9}" for n in self.dof))
+        if self.bounded:
+            cells = "".join(f"{f'{v:.1f} {u}':>9}" for v, u in zip(shown, units, strict=True))
+            lines.append("mean width".ljust(len(lines[-1]) - 54) + cells)
+        if self.with_truth and not self.compared:
+            lines.append("coverage    no frame matched the ground truth, by name or by stamp")
+        if self.compared:
+            share = self.covered / self.compared
+            lines.append(
+                "coverage".ljust(len(lines[-1]) - 54)
+                + "".join(f"{value:>9.3f}" for value in share)
+                + f"   all six {self.covered_jointly / self.compared:.3f} of {self.compared} frames"
+            )
+        return lines
+
+
+def run(
+    odometer: Odometer,
+    frames: Source,
+    write: Callable[[PoseInterval], None],
+    *,
+    summary: RunSummary,
+    truth: GroundTruth | None = None,
+    max_frames: int | None = None,
+) -> None:
+    """Step through ``frames``, write each estimate, and count it in ``summary``.
+
+    The summary is the caller's, so that it can still be shown when a source ends early.
+    """
+    with closing(odometer.stream(frames)) as estimates:
+        for estimate in islice(estimates, max_frames):
+            write(estimate)
+            summary.add(estimate, truth.pose_of(estimate) if truth else None)

@@ -1,0 +1,1 @@
+"""From a network to a bundle: scores, thresholds, drafts and writing."""

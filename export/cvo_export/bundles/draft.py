@@ -1,0 +1,136 @@
+"""A bundle folder, written whole or not at all; and what every draft of one has in common."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from cvo_edge import geometry
+from cvo_edge.bundle.format import (
+    MODEL_FILE,
+    ModelSpec,
+    PoseLimits,
+    Precision,
+    Provider,
+    Quaternion,
+    SelfTest,
+    Six,
+    SixPositive,
+)
+from cvo_edge.engine.session import Session
+from cvo_edge.pose import Chart
+
+Array = NDArray[np.float64]
+
+WORLD_FRAME, CAMERA_FRAME = "world", "camera"
+
+# Beyond this spread about the mean rotation the tangent at it comes near its cut at pi.
+MAX_SPREAD_RAD = 2.0
+# Least half-width in the normalised score, in standard deviations of each DoF.
+HALF_WIDTH_FLOOR = 0.01
+_LEAST_DEVIATION = 1e-6
+
+# How far beyond the known poses a pose is still plausible, in ranges of each DoF.
+_LIMIT_MARGIN = 0.5
+# The same in metres and radians, where the known poses may be few.
+FEW_POSES_MARGIN = 1.0
+# Metres, radians, probabilities. In 8 bits a rounding that falls to the other side on another kind
+# of processor moves outputs by up to .005, saturated products by more than .015 (boards/).
+_SELFTEST_TOLERANCE: dict[Precision, float] = {"fp32": 1e-3, "int8": 1e-2}
+# What works on 8-bit numbers.
+_QUANTISED = {
+    "ConvInteger",
+    "DynamicQuantizeLinear",
+    "MatMulInteger",
+    "QGemm",
+    "QLinearConv",
+    "QLinearMatMul",
+    "QuantizeLinear",
+}
+# Of another shape than any camera and model, so that resize and crop are tested, too.
+_SELFTEST_SIZE = (418, 650)
+
+
+def model_spec(model_bytes: bytes, opset: int, provider: Provider = "onnxruntime") -> ModelSpec:
+    """What the calibration says of a model; one that quantises anything is an int8 model."""
+    session = Session(model_bytes)
+    return ModelSpec(
+        file=MODEL_FILE,
+        sha256=hashlib.sha256(model_bytes).hexdigest(),
+        opset=opset,
+        precision=_precision(model_bytes),
+        inputs=session.inputs,
+        outputs=session.outputs,
+        provider=provider,
+    )
+
+
+def _precision(model_bytes: bytes) -> Precision:
+    kinds = {node.op_type for node in onnx.load_from_string(model_bytes).graph.node}
+    return "int8" if kinds & _QUANTISED else "fp32"
+
+
+def known_coordinates(poses: Array, reference_q_xyzw: Array) -> Array:
+    """Poses (n, 7) -> position and tangent at a reference rotation, (n, 6), m and rad."""
+    return Chart("tangent_reference", reference_q_xyzw).coordinates(poses, poses)
+
+
+def known_space(
+    poses: Array,
+) -> tuple[Quaternion | None, PoseLimits, SixPositive]:
+    """Mean rotation, plausible limits in the tangent there, and deviation, of known poses (n, 7).
+
+    The rotation is None where they spread too far for one tangent.
+    """
+    reference = geometry.mean_rotation(poses[:, 3:])
+    coordinates = known_coordinates(poses, reference)
+    spread = float(np.linalg.norm(coordinates[:, 3:], axis=1).max())
+    return (
+        four(reference) if spread <= MAX_SPREAD_RAD else None,
+        plausible(coordinates, FEW_POSES_MARGIN),
+        six(np.maximum(coordinates.std(axis=0), _LEAST_DEVIATION)),
+    )
+
+
+def plausible(coordinates: Array, least_margin: float = 0.0) -> PoseLimits:
+    """Limits around known poses (n, 6), half of their range wider on each side.
+
+    At least by ``least_margin``, metres and radians: few poses span little of where a camera goes.
+    """
+    lowest, highest = coordinates.min(axis=0), coordinates.max(axis=0)
+    margin = np.maximum(_LIMIT_MARGIN * (highest - lowest), least_margin)
+    return PoseLimits(lowest=six(lowest - margin), highest=six(highest + margin))
+
+
+def blank_selftest(precision: Precision) -> SelfTest:
+    """Return the self-test without the outputs that the model must give."""
+    height, width = _SELFTEST_SIZE
+    return SelfTest(
+        recipe="ripples-1",
+        height=height,
+        width=width,
+        outputs={},
+        tolerance=_SELFTEST_TOLERANCE[precision],
+    )
+
+
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Version of each installed package, for the provenance."""
+    return {package: importlib.metadata.version(package) for package in packages}
+
+
+def four(values: Array) -> Quaternion:
+    """Shape (4,) -> a quaternion."""
+    x, y, z, w = (float(value) for value in values)
+    return (x, y, z, w)
+
+
+def six(values: Array) -> Six:
+    """Shape (6,) -> six numbers."""
+    a, b, c, d, e, f = (float(value) for value in values)
+    return (a, b, c, d, e, f)

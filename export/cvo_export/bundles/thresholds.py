@@ -1,0 +1,368 @@
+"""Scores by running the exported model through the runtime -> thresholds.
+
+Coverage then depends on no fidelity of the export: whatever the graph computes (8-bit included) is
+what was calibrated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from cvo_edge.bundle.format import CONFIDENCES, Calibration, SixOrUnbounded, Threshold
+from cvo_edge.bundle.reading import Bundle
+from cvo_edge.conformal import (
+    conformal_quantile,
+    effective_sample_size,
+    hierarchical_quantile,
+    interval_score,
+)
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.heads import HEADS, Head
+from cvo_edge.heads.cqr import Sides
+from cvo_edge.odometer import Observation, Odometer
+from cvo_edge.programs.selftest import observe_selftest
+from cvo_edge.sets import ConformalSet, Scope
+from cvo_export.datasets import PoseDataset
+
+Array = NDArray[np.float64]
+Rule = Literal["pooled", "hierarchical"]
+Joint = Literal["max", "bonferroni"]
+
+SCOPES: tuple[Scope, Scope] = ("marginal", "joint")
+
+# What another score has to win on val by: smaller differences there are chance.
+_CLEARLY = 0.05
+
+
+class Candidate(NamedTuple):
+    """A score of the runtime's head and the ``method_parameters`` it goes with."""
+
+    score: str
+    parameters: Struct
+
+
+class Scored(NamedTuple):
+    """Scores of n frames of each scope, (n, sides, 6), and their sequence numbers (n,)."""
+
+    marginal: Array
+    joint: Array
+    sequence: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Frames that passed the frame checks, as the runtime sees them, stacked over n frames.
+
+    ``outputs`` by name (n, ...); ``point`` (n, 6) and ``truth`` (n, 6) in the bundle's chart;
+    ``pose`` (n, 7) and ``true_pose`` (n, 7); ``sequence`` (n,) the sequence number; ``invalid``
+    and ``degraded`` count the frames that the checks left out.
+    """
+
+    indices: NDArray[np.int64]
+    outputs: dict[str, NDArray[np.float32]]
+    point: Array
+    truth: Array
+    pose: Array
+    true_pose: Array
+    sequence: NDArray[np.int64]
+    invalid: int
+    degraded: int
+
+    def scored(self, head: Head) -> Scored:
+        """Return the scores of the true poses."""
+        marginal, joint = (
+            head.scores(self.outputs, self.point, self.truth, scope) for scope in SCOPES
+        )
+        return Scored(marginal, joint, self.sequence)
+
+    def regions(self, head: Head, entry: Threshold) -> list[ConformalSet]:
+        """Return the set of every frame at a threshold."""
+        return [
+            head.region(
+                {name: values[row : row + 1] for name, values in self.outputs.items()},
+                point,
+                entry,
+            )
+            for row, point in enumerate(self.point)
+        ]
+
+
+def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]) -> Observed:
+    """Run frames of a data set through the odometer's network, in order.
+
+    Raises SourceError where no frame passes the checks.
+    """
+    kept: list[int] = []
+    seen: list[Observation] = []
+    invalid = degraded = 0
+    for index in indices.tolist():
+        try:
+            image = dataset.read_image(index)
+        except SourceError:
+            image = None  # the odometer flags it as it would on the device
+        observation = odometer.observe(image, seq=index)
+        if observation.fault is not None:
+            invalid += 1
+        elif observation.doubt is not None:
+            degraded += 1
+        else:
+            kept.append(index)
+            seen.append(observation)
+    if not seen:
+        raise SourceError(
+            f"{dataset.name}: expected frames that pass the checks, found none of {len(indices)}"
+        )
+    pose = np.array([observation.pose for observation in seen])
+    true_pose = dataset.poses[kept]
+    return Observed(
+        indices=np.array(kept),
+        outputs={
+            name: np.concatenate([observation.outputs[name] for observation in seen])
+            for name in seen[0].outputs
+        },
+        point=np.array([observation.point for observation in seen]),
+        truth=odometer.chart.coordinates(true_pose, pose),
+        pose=pose,
+        true_pose=true_pose,
+        sequence=dataset.sequence[kept],
+        invalid=invalid,
+        degraded=degraded,
+    )
+
+
+def calibrated(
+    draft: Calibration,
+    model_bytes: bytes,
+    dataset: PoseDataset,
+    roles: Mapping[str, NDArray[np.int64]],
+    candidates: Sequence[Candidate],
+) -> Calibration:
+    """Fill in score, thresholds and self-test of a draft, by running the model on val and cal.
+
+    The draft names rule, joint scope, split and data set; val decides among the candidates, see
+    ``chosen``.
+
+    Raises
+    ------
+    BundleMismatchError, CalibrationFileError
+        The model or a candidate is not of the draft's method.
+    SourceError
+        No frame of val or cal passes the checks.
+    UsageError
+        Bonferroni's joint scope of a method that has a joint score.
+    """
+    if draft.calibration.joint == "bonferroni" and HEADS[draft.method].one_joint_score:
+        raise UsageError(
+            f"joint: expected max for {draft.method}, which has one score for all six, found "
+            "bonferroni"
+        )
+    first = with_candidate(draft, candidates[0])
+    with Odometer(Bundle(first, model_bytes)) as odometer:
+        val = observe(odometer, dataset, roles["val"])
+        cal = observe(odometer, dataset, roles["cal"])
+        selftest = {
+            name: tuple(float(f"{value:.9g}") for value in values.reshape(-1).tolist())
+            for name, values in observe_selftest(odometer).outputs.items()
+        }
+    scored = with_candidate(draft, chosen(draft, val, candidates))
+    scored = replace(scored, selftest=replace(scored.selftest, outputs=selftest))
+    return with_thresholds(scored, val, cal)
+
+
+def with_thresholds(calibration: Calibration, val: Observed, cal: Observed) -> Calibration:
+    """Return the calibration with the thresholds of these observations, and their counts.
+
+    Rule, joint scope and score are its own; val compares degrees of freedom for the joint scope.
+
+    Raises UsageError for a rule that is not computed here.
+    """
+    head = HEADS[calibration.method](calibration)
+    cal_scores = cal.scored(head)
+    source, rule = calibration.calibration, rule_of(calibration)
+    return replace(
+        calibration,
+        thresholds=thresholds(head, cal_scores, val.scored(head), rule, source.joint),
+        calibration=replace(
+            source,
+            n=len(cal.indices),
+            n_sequences=len(np.unique(cal.sequence)),
+            n_effective=round(effective_frames(cal_scores), 1),
+        ),
+    )
+
+
+def selected(
+    candidates: Sequence[Candidate], score: str | None, sides: Sides | None
+) -> tuple[Candidate, ...]:
+    """Return the candidates of this score, all if it is None, with these sides, if not None.
+
+    Raises UsageError for a score or sides that the method does not have.
+    """
+    names = list(dict.fromkeys(candidate.score for candidate in candidates))
+    if score is not None and score not in names:
+        raise UsageError(f"score: expected one of {', '.join(names)}, found {score}")
+    kept = [c for c in candidates if score in (None, c.score)]
+    if sides is None or (sides == "symmetric" and "sides" not in _names(kept[0])):
+        return tuple(kept)
+    if any("sides" not in _names(candidate) for candidate in kept):
+        raise UsageError(f"sides: expected symmetric, as the method has no others, found {sides}")
+    return tuple(c._replace(parameters=replace(c.parameters, sides=sides)) for c in kept)
+
+
+def _names(candidate: Candidate) -> tuple[str, ...]:
+    return candidate.parameters.__struct_fields__
+
+
+def with_candidate(draft: Calibration, candidate: Candidate) -> Calibration:
+    """Return the draft with this score and its parameters, everything unbounded."""
+    symmetric = getattr(candidate.parameters, "sides", "symmetric") == "symmetric"
+    unbounded: SixOrUnbounded = (None,) * 6
+    entries = tuple(
+        Threshold(
+            confidence=confidence,
+            scope=scope,
+            q_hat=unbounded,
+            q_hat_upper=None if symmetric else unbounded,
+        )
+        for confidence in CONFIDENCES
+        for scope in SCOPES
+    )
+    return replace(
+        draft,
+        thresholds=entries,
+        method_parameters=msgspec.to_builtins(candidate.parameters),
+        calibration=replace(draft.calibration, score=candidate.score),
+    )
+
+
+def chosen(draft: Calibration, val: Observed, candidates: Sequence[Candidate]) -> Candidate:
+    """Return the first candidate, unless another's sets on val, thresholded there, clearly win.
+
+    By the interval score at 0.9 over each DoF's deviation; val is too small to tell closer ones
+    apart.
+    """
+    results = []
+    for candidate in candidates:
+        calibration = with_candidate(draft, candidate)
+        head = HEADS[calibration.method](calibration)
+        scores = head.scores(val.outputs, val.point, val.truth)
+        entry = _threshold(0.9, "marginal", marginal_thresholds(head, scores, 0.9, _pooled))
+        limits = workspace(calibration)
+        regions = [region.within(*limits) for region in val.regions(head, entry)]
+        width = np.array([region.width() for region in regions])
+        distance = np.array([r.distance(y) for r, y in zip(regions, val.truth, strict=True)])
+        deviation = np.array(calibration.pose.standard_deviation)
+        results.append(float((interval_score(width, distance, 0.1) / deviation).mean()))
+    best = int(np.argmin(results))
+    return candidates[best if results[best] < (1.0 - _CLEARLY) * results[0] else 0]
+
+
+def workspace(calibration: Calibration) -> tuple[Array, Array]:
+    """Lowest and highest value per DoF, (6,) each, that stand in for an unbounded side."""
+    limits = calibration.pose.limits
+    lowest, highest = np.array(limits.lowest), np.array(limits.highest)
+    if calibration.pose.rotation == "tangent_predicted":
+        # Offsets about the prediction: at most a half turn.
+        lowest[3:], highest[3:] = -np.pi, np.pi
+    return lowest, highest
+
+
+def thresholds(
+    head: Head, cal: Scored, val: Scored, rule: Rule, joint: Joint
+) -> tuple[Threshold, ...]:
+    """Both scopes at every confidence, from scores on cal.
+
+    ``pooled`` counts frames, ``hierarchical`` sequences; what too few of them cannot support is
+    unbounded (null). Joint scope: ``max``, the largest score of a frame, made comparable on val;
+    or ``bonferroni``, six sets at a sixth of the miscoverage each. Scores that are one for all six
+    are equal and stay so.
+    """
+
+    def q_hat(scores: Array, confidence: float) -> float:
+        if rule == "hierarchical":
+            return hierarchical_quantile(scores, cal.sequence, confidence)
+        return conformal_quantile(scores, confidence)
+
+    scale = head.joint_scale(val.joint)
+    found = []
+    for confidence in CONFIDENCES:
+        marginal = marginal_thresholds(head, cal.marginal, confidence, q_hat)
+        found.append(_threshold(confidence, "marginal", marginal))
+        if joint == "bonferroni":
+            each = 1.0 - (1.0 - confidence) / 6
+            together = marginal_thresholds(head, cal.marginal, each, q_hat)
+        else:
+            used = _used_sides(head)
+            largest = scale.comparable(cal.joint)[:, used].max(axis=(1, 2))
+            together = np.full(cal.joint.shape[1:], np.inf)
+            together[used] = scale.thresholds(q_hat(largest, confidence))[used]
+        found.append(_threshold(confidence, "joint", together))
+    return tuple(found)
+
+
+def marginal_thresholds(
+    head: Head, scores: Array, confidence: float, q_hat: Callable[[Array, float], float]
+) -> Array:
+    """Scores (n, sides, 6) -> thresholds (sides, 6), infinite where unbounded."""
+    found = np.full(scores.shape[1:], np.inf)
+    for side, level in enumerate(head.side_confidences(confidence)):
+        if level is not None:
+            found[side] = [q_hat(scores[:, side, dof], level) for dof in range(6)]
+    return found
+
+
+def rule_of(calibration: Calibration) -> Rule:
+    """The calibration rule of a bundle; raises UsageError for one that is not computed here."""
+    rule = calibration.calibration.rule
+    if rule == "weighted":
+        raise UsageError("rule: expected pooled or hierarchical, found weighted")
+    return rule
+
+
+def effective_frames(scored: Scored) -> float:
+    """Independent frames that marginal scores are worth: the least over all columns.
+
+    Summed over sequences, which are independent of each other. An infinite score counts as the
+    largest finite one.
+    """
+    columns = [
+        np.minimum(column, column[np.isfinite(column)].max(initial=0.0))
+        for column in scored.marginal.reshape(len(scored.marginal), -1).T
+    ]
+    sequence = scored.sequence
+    return min(
+        sum(effective_sample_size(column[sequence == number]) for number in np.unique(sequence))
+        for column in columns
+    )
+
+
+def _used_sides(head: Head) -> NDArray[np.bool_]:
+    return np.array([level is not None for level in head.side_confidences(0.9)])
+
+
+def _pooled(scores: Array, confidence: float) -> float:
+    return conformal_quantile(scores, confidence)
+
+
+def _threshold(confidence: float, scope: Scope, values: Array) -> Threshold:
+    """Thresholds (sides, 6), infinite where unbounded, as they are stored."""
+    sides = [_six_or_unbounded(row) for row in values]
+    return Threshold(
+        confidence=confidence,
+        scope=scope,
+        q_hat=sides[0],
+        q_hat_upper=sides[1] if len(sides) == 2 else None,
+    )
+
+
+def _six_or_unbounded(values: Array) -> SixOrUnbounded:
+    a, b, c, d, e, f = (float(value) if np.isfinite(value) else None for value in values)
+    return (a, b, c, d, e, f)

@@ -1,0 +1,61 @@
+"""A bundle folder, written whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from cvo_edge.bundle.format import CALIBRATION_FILE, MODEL_FILE, Calibration
+from cvo_edge.bundle.reading import encode_calibration, read_calibration
+from cvo_edge.errors import SinkError
+from cvo_edge.odometer import Odometer
+from cvo_edge.programs.selftest import check_selftest
+
+
+def check_target(bundle_dir: Path) -> None:
+    """Raise SinkError where the folder holds something that is no bundle."""
+    own = {CALIBRATION_FILE, MODEL_FILE}
+    if bundle_dir.exists() and not (
+        bundle_dir.is_dir() and {path.name for path in bundle_dir.iterdir()} in (own, set())
+    ):
+        raise SinkError(
+            f"{bundle_dir}: expected a new folder or a bundle to replace, found other files"
+        )
+
+
+def write_bundle(bundle_dir: Path, calibration: Calibration, model_bytes: bytes) -> Calibration:
+    """Write beside the target, verify by reading and self-test, then move into place.
+
+    Raises
+    ------
+    GateError
+        The written bundle fails its own self-test.
+    SinkError
+        The folder cannot be written.
+    """
+    content = encode_calibration(calibration)
+    parent = bundle_dir.resolve().parent
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{bundle_dir.name}.", dir=parent))
+    except OSError as error:
+        raise SinkError(f"{parent}: cannot be written: {error.strerror}") from None
+    try:
+        partial.chmod(0o755)
+        (partial / MODEL_FILE).write_bytes(model_bytes)
+        (partial / CALIBRATION_FILE).write_bytes(content)
+        with Odometer.load(partial) as odometer:
+            check_selftest(odometer)
+        replaced = None
+        if bundle_dir.exists():
+            replaced = Path(tempfile.mkdtemp(prefix=f".{bundle_dir.name}.", dir=parent)) / "old"
+            bundle_dir.rename(replaced)
+        partial.rename(bundle_dir)
+        if replaced is not None:
+            shutil.rmtree(replaced.parent)
+    except OSError as error:
+        raise SinkError(f"{bundle_dir}: cannot be written: {error.strerror}") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return read_calibration(bundle_dir)

@@ -1,0 +1,1 @@
+"""What happens to a data set before training: splits, augmentation and noise."""

@@ -1,0 +1,290 @@
+"""Which frame has which role. No frame ever has two.
+
+``train`` fits the networks; ``fit`` is for models of residuals (CJP trains on train and fit
+together); ``val`` decides every choice (early stopping, score, scales); ``cal`` gives the
+thresholds and nothing else; ``test`` gives the final figures and nothing else. Where a finished
+network is only calibrated, on data that it has not seen, there are no frames to train on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.bundle.format import SplitSpec
+from cvo_edge.errors import SourceError, UsageError
+from cvo_export.datasets import PoseDataset
+
+Kind = Literal["random", "block", "sequence"]
+Purpose = Literal["training", "calibration"]
+SHARES: dict[Purpose, dict[str, float]] = {
+    "training": {"train": 0.4, "fit": 0.1, "val": 0.1, "cal": 0.2, "test": 0.2},
+    "calibration": {"val": 0.1, "cal": 0.7, "test": 0.2},
+}
+
+_BLOCKS = 20
+# Frames dropped on the two sides of a border between blocks of different roles.
+_GAP_BEFORE, _GAP_AFTER = 7, 8
+_LEAST_SURVIVING = 0.6
+# Ten calibration sequences make the hierarchical rule finite at 0.9; one to spare.
+_CALIBRATION_SEQUENCES, _MANY_SEQUENCES = 11, 30
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Split:
+    """Frame numbers by role, ascending; frames of no role were dropped (gaps)."""
+
+    kind: Kind
+    seed: int
+    purpose: Purpose
+    roles: Mapping[str, Indices]
+
+    def digest(self, dataset: PoseDataset) -> str:
+        """sha256 over the roles' frame names and poses: the same split of the same frames, or not.
+
+        Poses to a tenth of a millimetre and milliradian: how a reader rounds does not matter.
+        """
+        digest = hashlib.sha256(json.dumps(self._names(dataset), sort_keys=True).encode())
+        for role in sorted(self.roles):
+            digest.update(np.round(dataset.poses[self.roles[role]] * 1e4).astype("<i8").tobytes())
+        return digest.hexdigest()
+
+    def spec(self, dataset: PoseDataset) -> SplitSpec:
+        """Return what a bundle says of it."""
+        return SplitSpec(
+            purpose=self.purpose, kind=self.kind, seed=self.seed, sha256=self.digest(dataset)
+        )
+
+    def write(self, path: Path, dataset: PoseDataset) -> None:
+        """Write kind, seed and the frame names of every role as JSON."""
+        document = {
+            **msgspec.to_builtins(self.spec(dataset)),
+            "roles": self._names(dataset),
+        }
+        path.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+
+    def _names(self, dataset: PoseDataset) -> dict[str, list[str]]:
+        return {
+            role: [dataset.frame_names[index] for index in indices]
+            for role, indices in self.roles.items()
+        }
+
+
+def read_split_spec(path: Path) -> SplitSpec:
+    """Read what ``Split.write`` wrote, without the frame names."""
+    document = msgspec.json.decode(path.read_bytes())
+    del document["roles"]
+    return msgspec.convert(document, SplitSpec)
+
+
+def make_split(dataset: PoseDataset, kind: Kind, seed: int, purpose: Purpose = "training") -> Split:
+    """Give every frame at most one role.
+
+    ``random``: frames, exchangeable by construction but flattering on video; ``block``: 20
+    contiguous blocks with gaps where roles change; ``sequence``: whole sequences, the data set's
+    own test list respected. The same data set and arguments give the same split. For calibration
+    the frames of a data set's own test list are dealt, where it has one: those of its training list
+    are what networks are trained on.
+
+    Raises UsageError where the data set is too small for the kind.
+    """
+    generator = np.random.default_rng(seed)
+    frames = np.arange(len(dataset))
+    dealt = dataset
+    if purpose == "calibration" and dataset.own_test:
+        frames = np.flatnonzero(np.isin(dataset.sequence, sorted(dataset.own_test)))
+        dealt = _part(dataset, frames)
+    if kind == "random":
+        roles = _random(dealt, generator, SHARES[purpose])
+    elif kind == "block":
+        roles = _block(dealt, generator, SHARES[purpose])
+    else:
+        roles = _sequence(dealt, generator, SHARES[purpose])
+    roles = {role: frames[indices] for role, indices in roles.items()}
+    empty = [role for role, indices in roles.items() if indices.size == 0]
+    if empty:
+        raise UsageError(
+            f"split {kind}: expected frames for every role, found none for {', '.join(empty)} "
+            f"among {frames.size} frames of {np.unique(dealt.sequence).size} sequence(s)"
+        )
+    return Split(kind, seed, purpose, roles)
+
+
+def default_kind(dataset: PoseDataset, purpose: Purpose = "training") -> Kind:
+    """Return ``sequence`` where there are enough sequences for the roles, else ``block``."""
+    sequences = len(dataset.sequence_names)
+    if purpose == "calibration" and dataset.own_test:
+        sequences = len(dataset.own_test)
+    return "sequence" if sequences >= len(SHARES[purpose]) else "block"
+
+
+def same_split(dataset: PoseDataset, recorded: SplitSpec) -> Split:
+    """Make a recorded split again; raises SourceError where the data set is not the same."""
+    split = make_split(dataset, recorded.kind, recorded.seed, recorded.purpose)
+    found = split.digest(dataset)
+    if found != recorded.sha256:
+        raise SourceError(
+            f"{dataset.name}: expected the frames of the recorded {recorded.kind} split "
+            f"{recorded.sha256[:12]}..., found {found[:12]}...; is it another data set? "
+            "--subset all needs no split"
+        )
+    return split
+
+
+def deal_folds(dataset: PoseDataset, split: Split, indices: Indices, count: int) -> list[Indices]:
+    """Positions within ``indices`` (frame numbers), dealt into folds by the unit of the split.
+
+    Frames for a random split; for the others whole sequences or, where there are too few, runs of
+    frames that follow one another, as neighbouring frames would tell on each other.
+    """
+    unit = np.arange(indices.size)
+    if split.kind != "random":
+        unit = dataset.sequence[indices]
+        if np.unique(unit).size < count:
+            unit = np.cumsum(np.diff(indices, prepend=indices[:1]) != 1)
+        if np.unique(unit).size < count:
+            unit = np.arange(indices.size) * 3 * count // indices.size
+    names, unit = np.unique(unit, return_inverse=True)
+    fold_of = np.random.default_rng((split.seed, count)).permutation(names.size) % count
+    return [np.flatnonzero(fold_of[unit] == number) for number in range(count)]
+
+
+def training_frames(dataset: PoseDataset, split: Split, share: float) -> tuple[Indices, Indices]:
+    """Frame numbers of the roles train and fit, or of a share of each, drawn by the split's seed.
+
+    Whole frames of a random split, sequences or runs of neighbours of the others; at least one of
+    each. A smaller share is a part of a larger one.
+    """
+    if share == 1.0:
+        return split.roles["train"], split.roles["fit"]
+    found = []
+    for number, role in enumerate(("train", "fit")):
+        indices = split.roles[role]
+        unit = np.arange(indices.size)
+        if split.kind == "sequence":
+            unit = dataset.sequence[indices]
+        elif split.kind == "block":
+            unit = np.cumsum(np.diff(indices, prepend=indices[:1]) != 1)
+        names = np.unique(unit)
+        order = np.random.default_rng((split.seed, number)).permutation(names)
+        found.append(indices[np.isin(unit, order[: max(1, round(share * names.size))])])
+    return found[0], found[1]
+
+
+def _counts(total: int, shares: Mapping[str, float]) -> dict[str, int]:
+    """Whole numbers that add up to ``total``, by largest remainder; none is 0 if that can be."""
+    exact = {role: total * share / sum(shares.values()) for role, share in shares.items()}
+    counts = {role: int(value) for role, value in exact.items()}
+    by_remainder = sorted(exact, key=lambda role: counts[role] - exact[role])
+    for role in by_remainder[: total - sum(counts.values())]:
+        counts[role] += 1
+    if total >= len(counts):
+        while not all(counts.values()):
+            counts[max(counts, key=lambda role: counts[role])] -= 1
+            counts[min(counts, key=lambda role: counts[role])] += 1
+    return counts
+
+
+def _part(dataset: PoseDataset, frames: Indices) -> PoseDataset:
+    """These frames of a data set, without lists of its own; frame numbers begin at 0 again."""
+    return replace(
+        dataset,
+        poses=dataset.poses[frames],
+        sequence=dataset.sequence[frames],
+        frame_names=tuple(dataset.frame_names[index] for index in frames.tolist()),
+        own_train=frozenset(),
+        own_test=frozenset(),
+    )
+
+
+def _deal(items: Indices, counts: Mapping[str, int]) -> dict[str, Indices]:
+    stops = np.cumsum(list(counts.values()))
+    return dict(zip(counts, np.split(items, stops[:-1]), strict=True))
+
+
+def _random(
+    dataset: PoseDataset, generator: np.random.Generator, shares: Mapping[str, float]
+) -> dict[str, Indices]:
+    shuffled = generator.permutation(len(dataset))
+    dealt = _deal(shuffled, _counts(len(dataset), shares))
+    return {role: np.sort(indices) for role, indices in dealt.items()}
+
+
+def _block(
+    dataset: PoseDataset, generator: np.random.Generator, shares: Mapping[str, float]
+) -> dict[str, Indices]:
+    blocks: list[Indices] = []
+    for number in range(len(dataset.sequence_names)):
+        frames = np.flatnonzero(dataset.sequence == number)
+        pieces = max(1, round(_BLOCKS * frames.size / len(dataset)))
+        blocks += [block for block in np.array_split(frames, pieces) if block.size]
+    dealt = _deal(generator.permutation(len(blocks)), _counts(len(blocks), shares))
+    role_of = {int(block): role for role, members in dealt.items() for block in members}
+    roles: dict[str, list[Indices]] = {role: [] for role in shares}
+    for index, block in enumerate(blocks):
+        start = _GAP_AFTER if _border(dataset, blocks, role_of, index - 1) else 0
+        stop = block.size - (_GAP_BEFORE if _border(dataset, blocks, role_of, index) else 0)
+        roles[role_of[index]].append(block[start : max(start, stop)])
+    surviving = sum(part.size for parts in roles.values() for part in parts)
+    if surviving < _LEAST_SURVIVING * len(dataset):
+        raise UsageError(
+            f"split block: expected at least {_LEAST_SURVIVING:.0%} of the frames to survive the "
+            f"gaps, found {surviving} of {len(dataset)}; the recording is too short (--split "
+            "random deals single frames)"
+        )
+    empty = np.empty(0, np.int64)
+    return {role: np.concatenate(parts) if parts else empty for role, parts in roles.items()}
+
+
+def _border(
+    dataset: PoseDataset, blocks: list[Indices], role_of: Mapping[int, str], index: int
+) -> bool:
+    """Whether blocks ``index`` and ``index + 1`` touch in time and have different roles."""
+    if not 0 <= index < len(blocks) - 1:
+        return False
+    same = dataset.sequence[blocks[index][0]] == dataset.sequence[blocks[index + 1][0]]
+    return bool(same) and role_of[index] != role_of[index + 1]
+
+
+def _sequence(
+    dataset: PoseDataset, generator: np.random.Generator, shares: Mapping[str, float]
+) -> dict[str, Indices]:
+    everything = np.unique(dataset.sequence).tolist()
+    test = np.array(sorted(dataset.own_test), dtype=np.int64)
+    pool = sorted((dataset.own_train or frozenset(everything)) - dataset.own_test)
+    shuffled = generator.permutation(np.array(pool, dtype=np.int64))
+    dealt_shares = dict(shares)
+    if test.size:
+        del dealt_shares["test"]
+    counts = _counts(shuffled.size, dealt_shares)
+    if "fit" in shares and len(everything) >= _MANY_SEQUENCES:
+        counts = _more_calibration(counts)
+    dealt = _deal(shuffled, counts)
+    if test.size:
+        dealt["test"] = test
+    return {
+        role: np.flatnonzero(np.isin(dataset.sequence, dealt[role])).astype(np.int64)
+        for role in shares
+    }
+
+
+def _more_calibration(counts: Mapping[str, int]) -> dict[str, int]:
+    """Enough calibration sequences for the hierarchical rule, taken from fit and val in turn."""
+    changed = dict(counts)
+    for _ in range(2 * _CALIBRATION_SEQUENCES):
+        donor = max(("val", "fit"), key=lambda role: changed[role])
+        if changed["cal"] >= _CALIBRATION_SEQUENCES or changed[donor] <= 1:
+            break
+        changed[donor] -= 1
+        changed["cal"] += 1
+    return changed

@@ -1,0 +1,1 @@
+"""The ONNX graph: export from torch, and 8-bit quantisation."""

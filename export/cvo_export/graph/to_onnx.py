@@ -1,0 +1,95 @@
+"""torch -> one ONNX graph, names and opset fixed, and proof that both compute the same."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import warnings
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from cvo_edge.engine.session import Session
+from cvo_edge.errors import GateError
+
+OPSET = 18
+
+# Largest difference between torch and onnxruntime in float32, in metres, radians or quaternion
+# units; both round in another order.
+PARITY_TOLERANCE = 1e-4
+
+
+def export_onnx(
+    module: nn.Module,
+    inputs: Sequence[Tensor],
+    input_names: Sequence[str],
+    output_names: Sequence[str],
+) -> bytes:
+    """Export a module for inputs of exactly these shapes -> the bytes of one ONNX file."""
+    module.eval()
+    # The exporter reports its steps on stdout and through a logger; stdout belongs to our data.
+    exporter_log = logging.getLogger("torch.onnx")
+    level = exporter_log.level
+    exporter_log.setLevel(logging.ERROR)
+    try:
+        with (
+            torch.no_grad(),
+            warnings.catch_warnings(),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(
+                module,
+                tuple(inputs),
+                input_names=list(input_names),
+                output_names=list(output_names),
+                opset_version=OPSET,
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        exporter_log.setLevel(level)
+    if program is None:
+        raise GateError("export: expected a graph from torch.onnx, found none")
+    proto = program.model_proto
+    # Names of source files and lines of this machine are of no use on a board.
+    for node in proto.graph.node:
+        del node.metadata_props[:]
+        node.doc_string = ""
+    del proto.graph.metadata_props[:]
+    for value in (*proto.graph.value_info, *proto.graph.input, *proto.graph.output):
+        del value.metadata_props[:]
+    content: bytes = proto.SerializeToString()
+    return content
+
+
+def check_parity(
+    module: nn.Module,
+    session: Session,
+    feeds: Iterable[dict[str, NDArray[np.generic]]],
+    input_names: Sequence[str],
+) -> float:
+    """Largest absolute difference of any output between torch and the exported graph.
+
+    Raises GateError where it exceeds ``PARITY_TOLERANCE`` or is NaN.
+    """
+    names = [spec.name for spec in session.outputs]
+    worst = 0.0
+    module.eval()
+    for feed in feeds:
+        found = session.run(feed)
+        with torch.no_grad():
+            expected = module(*(torch.from_numpy(feed[name]) for name in input_names))
+        for name, tensor in zip(names, expected, strict=True):
+            difference = float(np.abs(tensor.numpy() - found[name]).max())
+            worst = max(worst, difference) if difference == difference else np.inf
+    if not worst <= PARITY_TOLERANCE:
+        raise GateError(
+            f"export: expected torch and onnxruntime to agree within {PARITY_TOLERANCE:g}, "
+            f"found a difference of {worst:.3g}"
+        )
+    return worst

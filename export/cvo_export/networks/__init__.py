@@ -1,0 +1,1 @@
+"""Networks: backbones, heads of the methods, baselines and losses."""

@@ -1,0 +1,21 @@
+"""The networks, one method a file, of the same names as in ``cvo_edge.heads``.
+
+``METHODS`` is the registry: a new method is one file here, one of the same name in the runtime, and
+one line in each registry.
+"""
+
+from __future__ import annotations
+
+from cvo_export.networks.heads import cjp, cqr, csp, mcqr
+from cvo_export.networks.heads.base import ExportedHead, Lessons, Method, Setting
+
+__all__ = ["METHODS", "ExportedHead", "HeadConfig", "Lessons", "Method", "Setting"]
+
+METHODS: dict[str, Method] = {
+    "cjp": cjp.METHOD,
+    "cqr": cqr.METHOD,
+    "csp": csp.METHOD,
+    "mcqr": mcqr.METHOD,
+}
+
+HeadConfig = cjp.CjpConfig | cqr.CqrConfig | csp.CspConfig | mcqr.McqrConfig

@@ -1,0 +1,302 @@
+"""Conformalized set prediction: every degree of freedom as K classes, one softmax each.
+
+The paper's section III-B. Classes are cut at the quantiles of the training poses, so that they are
+narrow where the camera was often; a shared trunk gives the logits of all six degrees of freedom.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from msgspec import Meta, Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from cvo_edge.conformal import conformal_quantile, interval_score
+from cvo_edge.heads.csp import CspParameters, Score, class_scores
+from cvo_export.bundles.thresholds import Candidate
+from cvo_export.networks.heads.base import (
+    DOF,
+    ExportedHead,
+    Learner,
+    Lessons,
+    Method,
+    Setting,
+    Standardise,
+    dense,
+)
+from cvo_export.networks.standardised import PoseDecoder
+
+Array = NDArray[np.float64]
+
+# The workspace ends this far beyond the training poses, in ranges of each DoF.
+_MARGIN = 0.1
+_TEMPERATURES = np.exp(np.linspace(np.log(0.1), np.log(10.0), 97))
+# Values of Angelopoulos et al. 2021, appendix: which is best depends on the network.
+_PENALTIES = (0.001, 0.01, 0.1, 0.2, 0.5)
+_FREE_RANKS = 5
+# Narrow labels where classes are as wide as the errors, wide ones on new recordings. The middle one
+# where only one network can be trained.
+_SIGMAS = (1.5, 4.0, 10.0)
+
+
+class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unknown_fields=True):
+    """The choices of classes, labels and network; the paper's labels are one_hot.
+
+    Attributes
+    ----------
+    classes
+        K, for each degree of freedom; fewer where training poses repeat.
+    labels
+        ``ordinal``: a Gaussian over the classes about the truth; ``one_hot``.
+    label_sigma
+        Standard deviation of that Gaussian, in classes; None lets val choose among 1.5, 4 and 10.
+    hidden
+        Widths of the trunk's two layers.
+    feature_noise
+        Standard deviation of Gaussian noise on the standardised features while training.
+    dropout
+        Dropout behind the trunk's layers while training.
+    """
+
+    classes: Annotated[int, Meta(ge=2, le=256)] = 128
+    labels: Literal["ordinal", "one_hot"] = "ordinal"
+    label_sigma: Annotated[float, Meta(gt=0)] | None = None
+    hidden: tuple[int, int] = (256, 128)
+    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
+    dropout: Annotated[float, Meta(ge=0, lt=1)] = 0.0
+
+
+class Classes(nn.Module):
+    """The classes of all six degrees of freedom, in standardised numbers.
+
+    Buffers ``edges`` (6, K + 1), where a DoF with fewer classes repeats its last edge, ``medians``
+    (6, K) of the training poses in each class, and ``used`` (6, K).
+    """
+
+    def __init__(self, edges: Tensor, medians: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("edges", edges)
+        self.register_buffer("medians", medians)
+        self.register_buffer("used", edges[:, 1:] > edges[:, :-1])
+        self.edges: Tensor
+        self.medians: Tensor
+        self.used: Tensor
+
+    @classmethod
+    def cut(cls, y: Array, count: int) -> Classes:
+        """Cut standardised training poses (n, 6) into at most ``count`` classes a DoF."""
+        rows, middles = [], []
+        for values in y.T:
+            # No more classes than there are gaps between poses: a camera may rest.
+            shares = min(count, np.unique(values).size - 1)
+            edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, shares + 1)))
+            margin = _MARGIN * (edges[-1] - edges[0])
+            edges[0] -= margin
+            edges[-1] += margin
+            index = np.searchsorted(edges[1:-1], values, side="right")
+            medians = [
+                np.median(values[index == k]) if (index == k).any() else edges[k : k + 2].mean()
+                for k in range(edges.size - 1)
+            ]
+            missing = count + 1 - edges.size
+            rows.append(np.append(edges, [edges[-1]] * missing))
+            middles.append(np.append(medians, [0.0] * missing))
+        table = torch.from_numpy(np.array(rows))
+        # Where every DoF has fewer classes than asked for, so has the network.
+        most = int((table[:, 1:] > table[:, :-1]).sum(dim=1).max())
+        return cls(table[:, : most + 1], torch.from_numpy(np.array(middles))[:, :most])
+
+    @property
+    def count(self) -> int:
+        """K, the most classes of any DoF."""
+        return int(self.used.shape[1])
+
+    def index(self, y: Tensor) -> Tensor:
+        """Standardised truth (n, 6) -> its class, (n, 6); beyond the workspace the outermost."""
+        inside = torch.arange(1, self.count) < self.used.sum(dim=1, keepdim=True)
+        inner = torch.where(inside, self.edges[:, 1:-1], torch.inf)
+        return torch.searchsorted(inner, y.double().T.contiguous(), right=True).T
+
+    def position(self, y: Tensor) -> Tensor:
+        """Standardised truth (n, 6) -> where it lies among the classes; k in the middle of k."""
+        index = self.index(y).T
+        low, high = self.edges.gather(1, index), self.edges.gather(1, index + 1)
+        within = ((y.double().T - low) / (high - low)).clamp(0.0, 1.0)
+        return (index + within - 0.5).T.float()
+
+    def widths(self) -> Array:
+        """Width of every class, (6, K)."""
+        widths: Array = np.diff(self.edges.numpy(), axis=1)
+        return widths
+
+
+class CspNetwork(nn.Module):
+    """Features (n, size) -> logits (n, 6, K); those of unused classes are hugely negative."""
+
+    def __init__(self, size: int, config: CspConfig, classes: Classes) -> None:
+        super().__init__()
+        wide, narrow = config.hidden
+        self.classes = classes
+        self.standardise = Standardise(size, config.feature_noise)
+        self.layers = nn.Sequential(
+            *dense(size, wide, config.dropout),
+            *dense(wide, narrow, config.dropout),
+            nn.Linear(narrow, DOF * classes.count),
+        )
+        self.register_buffer("blocked", torch.where(classes.used, 0.0, -1e9).float())
+        self.blocked: Tensor
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Shape (n, size) -> (n, 6, K)."""
+        logits: Tensor = self.layers(self.standardise(features))
+        return logits.reshape(-1, DOF, self.classes.count) + self.blocked
+
+
+class CspLearner(Learner):
+    """The network with the cross-entropy against soft or one-hot labels."""
+
+    def __init__(self, size: int, config: CspConfig, classes: Classes, sigma: float) -> None:
+        super().__init__()
+        self.one_hot = config.labels == "one_hot"
+        self.sigma = sigma
+        self.network = CspNetwork(size, config, classes)
+        self.standardise = self.network.standardise
+
+    def labels(self, y: Tensor) -> Tensor:
+        """Standardised truth (n, 6) -> what the softmax should be, (n, 6, K)."""
+        classes = self.network.classes
+        if self.one_hot:
+            return one_hot(classes.index(y), classes.count).float()
+        distance = torch.arange(classes.count) - classes.position(y)[..., None]
+        weight = torch.exp(-0.5 * (distance / self.sigma) ** 2) * classes.used
+        return weight / weight.sum(dim=-1, keepdim=True)
+
+    def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
+        """Features (n, size), truth (n, 6) -> scalar."""
+        logarithm = torch.log_softmax(self.network(features), dim=-1)
+        return -(self.labels(y) * logarithm).sum(dim=-1).mean()
+
+    def val_score(self, features: Tensor, y: Array) -> float:
+        """As ``Learner``; of the sets by the ``aps`` score."""
+        probabilities = torch.softmax(self.network(features), dim=-1).double().numpy()
+        return float(set_score(self.network.classes, probabilities, y).mean())
+
+
+def set_score(classes: Classes, probabilities: Array, y: Array) -> Array:
+    """Interval score at 90 % of the ``aps`` sets, (n, 6), thresholds taken on these very frames.
+
+    Probabilities (n, 6, K), standardised truth (n, 6).
+    """
+    scores = class_scores(probabilities, Score.APS)
+    edges = classes.edges.numpy()
+    index = classes.index(torch.from_numpy(y)).numpy()[..., np.newaxis]
+    of_truth = np.take_along_axis(scores, index, axis=-1)[..., 0]
+    outside = (y < edges[:, 0]) | (y > edges[:, -1])
+    of_truth = np.where(outside, np.inf, of_truth)
+    q_hat = np.array([conformal_quantile(of_truth[:, dof], 0.9) for dof in range(DOF)])
+    inside = (scores <= q_hat[:, np.newaxis]) & classes.used.numpy()
+    np.put_along_axis(inside, probabilities.argmax(axis=-1)[..., np.newaxis], True, axis=-1)
+    low, high, truth = edges[:, :-1], edges[:, 1:], y[..., np.newaxis]
+    gap = np.maximum(np.maximum(low - truth, truth - high), 0.0)
+    distance = np.where(inside, gap, np.inf).min(axis=-1)
+    return interval_score((inside * classes.widths()).sum(axis=-1), distance, 0.1)
+
+
+class CspHead(ExportedHead):
+    """Features -> pose (n, 7), the expected class median, and probabilities (n, 6, K)."""
+
+    output_names = ("pose", "probabilities")
+    runtime_method = "csp"
+
+    def __init__(self, network: CspNetwork, temperature: Tensor, setting: Setting) -> None:
+        super().__init__()
+        self.network = network
+        self.decoder = PoseDecoder(setting.target)
+        self.register_buffer("temperature", temperature)
+        self.temperature: Tensor
+        self.register_buffer("medians", network.classes.medians.float())
+        self.medians: Tensor
+        classes, target = network.classes, setting.target
+        edges = classes.edges.numpy() * target.std[:, np.newaxis] + target.mean[:, np.newaxis]
+        used = classes.used.sum(dim=1).tolist()
+        self._edges = [
+            tuple(float(f"{edge:.9g}") for edge in row[: count + 1].tolist())
+            for row, count in zip(edges, used, strict=True)
+        ]
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return pose (n, 7) in metres and probabilities (n, 6, K)."""
+        logits = self.network(features) / self.temperature[:, None]
+        probabilities = torch.softmax(logits, dim=-1)
+        point = (probabilities * self.medians).sum(dim=-1)
+        return self.decoder.pose(self.decoder(point)), probabilities
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """``aps`` before the paper's ``lac`` and ``raps`` with penalties of growing weight."""
+        a, b, c, d, e, f = self._edges
+        plain = CspParameters(edges=(a, b, c, d, e, f), penalty=0.0, free_ranks=0)
+        return (
+            Candidate("aps", plain),
+            Candidate("lac", plain),
+            *(
+                Candidate("raps", replace(plain, penalty=penalty, free_ranks=_FREE_RANKS))
+                for penalty in _PENALTIES
+            ),
+        )
+
+
+def _train(lessons: Lessons, config: CspConfig) -> CspHead:
+    setting = lessons.setting
+    classes = Classes.cut(setting.target.standardised(lessons.poses()), config.classes)
+    sigmas: tuple[float, ...] = _SIGMAS
+    if config.label_sigma is not None:
+        sigmas = (config.label_sigma,)
+    elif lessons.fine_tuned or config.labels == "one_hot":
+        sigmas = _SIGMAS[1:2]
+
+    def learn(sigma: float) -> CspLearner:
+        size = setting.feature_size
+        return lessons.learn(
+            f"csp-sigma{sigma:g}", lambda: CspLearner(size, config, copy.deepcopy(classes), sigma)
+        )
+
+    learners = [learn(sigma) for sigma in sigmas]
+    features, poses = lessons.val()
+    y = setting.target.standardised(poses)
+    with torch.no_grad():
+        network = min(learners, key=lambda learner: learner.val_score(features, y)).network
+        logits = network(features).double()
+    temperature = best_temperatures(logits, classes.index(torch.from_numpy(y)))
+    return CspHead(network, temperature, setting)
+
+
+def best_temperatures(logits: Tensor, index: Tensor) -> Tensor:
+    """Temperature of each DoF, (6,), with the greatest likelihood of the true classes.
+
+    Logits (n, 6, K) and classes (n, 6), on val (Guo et al. 2017).
+    """
+    losses = []
+    for temperature in _TEMPERATURES.tolist():
+        logarithm = torch.log_softmax(logits / temperature, dim=-1)
+        losses.append(-logarithm.gather(2, index[..., None])[..., 0].mean(dim=0))
+    best = torch.stack(losses).argmin(dim=0)
+    return torch.from_numpy(_TEMPERATURES)[best].float()
+
+
+def _restore(setting: Setting, config: CspConfig, state: Mapping[str, Tensor]) -> CspHead:
+    prefix = "network.classes."
+    classes = Classes(state[prefix + "edges"], state[prefix + "medians"])
+    network = CspNetwork(setting.feature_size, config, classes)
+    head = CspHead(network, state["temperature"], setting)
+    head.load_state_dict(state)
+    return head
+
+
+METHOD = Method(CspConfig, _train, _restore)

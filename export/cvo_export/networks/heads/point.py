@@ -1,0 +1,220 @@
+"""The point network: features -> one pose, and what its errors are on frames it has not seen."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from cvo_edge.errors import UsageError
+from cvo_edge.pose import Chart
+from cvo_export.networks.heads.base import (
+    DOF,
+    Learner,
+    Lessons,
+    Setting,
+    Standardise,
+    conformalised_score,
+    dense,
+)
+from cvo_export.networks.standardised import PoseDecoder
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Residuals = Literal["auto", "cross_fitted", "held_out"]
+
+# Fewer training frames than this are too few to set a part aside for models of residuals.
+_MANY_FRAMES = 1500
+_FOLDS = 3
+_LEAST_DEVIATION = 1e-6
+
+
+class PointNetwork(nn.Module):
+    """Features (n, size) -> standardised pose (n, 6)."""
+
+    def __init__(
+        self, size: int, hidden: tuple[int, int], feature_noise: float, dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        wide, narrow = hidden
+        self.dropout = dropout
+        self.standardise = Standardise(size, feature_noise)
+        self.layers = nn.Sequential(
+            *dense(size, wide), *dense(wide, narrow, dropout), nn.Linear(narrow, DOF)
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Shape (n, size) -> (n, 6)."""
+        point: Tensor = self.layers(self.standardise(features))
+        return point
+
+    def passes(self, features: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Features (n, size) -> stochastic passes with the dropout of training, (count, n, 6).
+
+        MC-dropout (Gal and Ghahramani 2016) behind the last hidden layer; all before it is computed
+        once.
+        """
+        *trunk, last = (layer for layer in self.layers if not isinstance(layer, nn.Dropout))
+        hidden = self.standardise(features)
+        for layer in trunk:
+            hidden = layer(hidden)
+        kept = 1.0 - self.dropout
+        mask = torch.rand((count, *hidden.shape), generator=generator) < kept
+        point: Tensor = last(hidden * mask / kept)
+        return point
+
+
+class PointLearner(Learner):
+    """The point network with the mean absolute error: the centre of an interval is a median."""
+
+    def __init__(
+        self, size: int, hidden: tuple[int, int], feature_noise: float, dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        self.network = PointNetwork(size, hidden, feature_noise, dropout)
+        self.standardise = self.network.standardise
+
+    def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
+        """Features (n, size), truth (n, 6) -> scalar."""
+        error: Tensor = self.network(features) - y
+        return error.abs().mean()
+
+    def val_score(self, features: Tensor, y: Array) -> float:
+        """As ``Learner``; of intervals of one width about the point."""
+        point = self.network(features).double().numpy()
+        return conformalised_score(point, point, y)
+
+
+class HeldOut(NamedTuple):
+    """A point network, and networks that have not seen the frames whose residuals count.
+
+    Attributes
+    ----------
+    network
+        The one that is shipped.
+    rows
+        Training images, as rows of the lessons, that have a network which has not seen them.
+    parts
+        Such rows, and their network.
+    """
+
+    network: PointNetwork
+    rows: Indices
+    parts: list[tuple[Indices, PointNetwork]]
+
+    def points(self, features: NDArray[np.float16]) -> Array:
+        """Features (copies, n, size) -> standardised points (copies, rows, 6)."""
+        found = np.zeros((*features.shape[:2], DOF))
+        for part, network in self.parts:
+            with torch.no_grad():
+                for copy, values in enumerate(features[:, part]):
+                    found[copy, part] = network(torch.from_numpy(values).float()).numpy()
+        return found[:, self.rows]
+
+    def passes(self, features: NDArray[np.float16], count: int, seed: int) -> Array:
+        """Features (copies, n, size) -> stochastic points (count * copies, rows, 6)."""
+        generator = torch.Generator().manual_seed(seed)
+        found = np.zeros((count, *features.shape[:2], DOF))
+        for part, network in self.parts:
+            with torch.no_grad():
+                for copy, values in enumerate(features[:, part]):
+                    drawn = network.passes(torch.from_numpy(values).float(), count, generator)
+                    found[:, copy, part] = drawn.numpy()
+        return found[:, :, self.rows].reshape(-1, self.rows.size, DOF)
+
+
+def learn_held_out(
+    lessons: Lessons,
+    name: str,
+    residuals: Residuals,
+    hidden: tuple[int, int],
+    feature_noise: float,
+    dropout: float = 0.0,
+) -> HeldOut:
+    """Train the point network, and those of the other folds where residuals are cross-fitted.
+
+    ``held_out``: the network learns from the role train, residuals are those of fit. ``auto``:
+    cross-fitted below 1500 training frames. Raises UsageError for cross-fitted residuals with a
+    backbone that learns, too: it has seen all frames.
+    """
+    everything = np.arange(lessons.n_images)
+    cross_fitted = residuals == "cross_fitted"
+    if residuals == "auto":
+        cross_fitted = not lessons.fine_tuned and everything.size < _MANY_FRAMES
+    if cross_fitted and lessons.fine_tuned:
+        raise UsageError(
+            "residuals: expected held_out with a backbone that learns, too, found cross_fitted"
+        )
+
+    def learn(lesson: str, rows: Indices) -> PointNetwork:
+        size = lessons.setting.feature_size
+        return lessons.learn(
+            lesson, lambda: PointLearner(size, hidden, feature_noise, dropout), rows
+        ).network
+
+    if not cross_fitted:
+        network = learn(name, everything[: lessons.n_train])
+        rows = everything[lessons.n_train :]
+        return HeldOut(network, rows, [(rows, network)])
+    parts = [
+        (fold, learn(f"{name}-fold{number}", np.setdiff1d(everything, fold)))
+        for number, fold in enumerate(lessons.folds(_FOLDS))
+    ]
+    return HeldOut(learn(name, everything), everything, parts)
+
+
+def residuals_of(setting: Setting, point: Array, poses: Array) -> Array:
+    """Standardised points (..., 6), true poses (..., 7) -> (t - t_hat, Log(R_hat^T R)), (..., 6).
+
+    In metres and radians, the chart ``tangent_predicted`` less the prediction's own place in it.
+    """
+    decoder = PoseDecoder(setting.target)
+    flat = torch.from_numpy(point.reshape(-1, DOF)).float()
+    predicted = decoder.pose(decoder(flat)).double().numpy()
+    chart = Chart("tangent_predicted")
+    origin = chart.coordinates(predicted, predicted)
+    residual = chart.coordinates(poses.reshape(-1, 7), predicted) - origin
+    return np.asarray(residual).reshape(*point.shape)
+
+
+def check_components(lessons: Lessons, count: int) -> None:
+    """Raise UsageError where there are not so many principal components; before any lesson."""
+    most = min(lessons.n_images, lessons.setting.feature_size)
+    if count > most:
+        raise UsageError(
+            f"components: expected at most {most}, the lesser of training frames and features, "
+            f"found {count}"
+        )
+
+
+def deviation_of(residual: Array) -> Array:
+    """Residuals (..., 6) -> 1.4826 times the median distance from the median: a Gaussian's sigma.
+
+    Shape (6,), at least 1e-6.
+    """
+    flat = residual.reshape(-1, DOF)
+    spread = np.median(np.abs(flat - np.median(flat, axis=0)), axis=0)
+    return np.asarray(np.maximum(1.4826 * spread, _LEAST_DEVIATION))
+
+
+def principal_components(
+    network: PointNetwork, features: NDArray[np.float16], count: int
+) -> Tensor:
+    """Features (n, size) -> directions of the greatest spread, standardised, (size, count)."""
+    with torch.no_grad():
+        x = network.standardise(torch.from_numpy(features).float()).double()
+    _, _, directions = torch.linalg.svd(x - x.mean(dim=0), full_matrices=False)
+    kept: Tensor = directions[:count].T.float().contiguous()
+    return kept
+
+
+def compressed(
+    network: PointNetwork, features: NDArray[np.float16], components: Tensor
+) -> NDArray[np.float32]:
+    """Features (copies, n, size) -> principal components (copies, n, count)."""
+    with torch.no_grad():
+        found = [network.standardise(torch.from_numpy(f).float()) @ components for f in features]
+    return np.stack([values.numpy() for values in found])

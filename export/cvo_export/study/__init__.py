@@ -1,0 +1,1 @@
+"""Studies: grids of runs, the engines that run them, and their reports."""

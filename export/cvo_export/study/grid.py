@@ -1,0 +1,322 @@
+"""A study: grids of methods, backbones, data, noise, options and seeds; every cell once.
+
+The configuration is TOML, a list of grids; see ``Grid``. Cells that two grids have in common are
+run once. All are kept in one folder, so that an interrupted study goes on, and so that a study that
+has grown runs what is new.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta, Struct
+
+from cvo_edge.errors import UsageError
+from cvo_export.bundles.draft import versions
+from cvo_export.data.noise import parse_noise
+from cvo_export.data.splits import Kind, default_kind
+from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.datasets.describe import summary
+from cvo_export.files import write_json
+from cvo_export.networks.backbone import TIMM_WEIGHTS, Backbone, load_weights
+from cvo_export.progress import Progress
+from cvo_export.study.cells import CONFIDENCE, Cell, CellFolder, Say
+from cvo_export.study.frame_times import Timing, timed
+from cvo_export.study.workers import Engine
+from cvo_export.training.configure import configure
+from cvo_export.training.loop import check_roles
+from cvo_export.training.run import TrainConfig
+
+RESULTS_FILE = "results.json"
+
+Value = str | int | float
+# Options of the backbone and of the data; all others are the method's own.
+_OF_THE_NETWORK = ("stages", "grid", "share")
+
+
+class Grid(Struct, frozen=True, forbid_unknown_fields=True):
+    """All combinations of its lists.
+
+    Attributes
+    ----------
+    name
+        Of the grid, in the report.
+    data
+        ``FORMAT:PATH`` each; ``$NAME`` and ``${NAME}`` stand for variables of the environment.
+    split
+        One for all data; by default ``sequence`` where there are five or more, else ``block``.
+    methods, backbones
+        Names.
+    weights
+        ``timm``, ``none`` or a file, as for ``train``; variables as in ``data``.
+    seeds
+        How many, from 0 on.
+    noises
+        ``NAME`` or ``NAME:STRENGTH`` each; every cell is also evaluated on test frames with each.
+    vary
+        Option -> its values: ``stages``, ``grid``, ``share`` (of the training frames) or one of the
+        methods'.
+    size, stages, grid, copies, steps, fine_tune
+        As for ``train``.
+    """
+
+    name: Annotated[str, Meta(min_length=1, max_length=60)]
+    data: Annotated[list[str], Meta(min_length=1)]
+    methods: Annotated[list[str], Meta(min_length=1)]
+    split: Kind | None = None
+    backbones: Annotated[list[str], Meta(min_length=1)] = msgspec.field(
+        default_factory=lambda: ["mobilenetv2_100"]
+    )
+    weights: str = "timm"
+    seeds: Annotated[int, Meta(ge=1)] = 3
+    noises: list[str] = []
+    vary: dict[str, Annotated[list[Value], Meta(min_length=1)]] = {}
+    size: str = "256x192"
+    stages: str = "16"
+    grid: str = "3x4"
+    copies: Annotated[int, Meta(ge=0)] | None = None
+    steps: Annotated[int, Meta(ge=1)] | None = None
+    fine_tune: Annotated[int, Meta(ge=0)] | None = None
+
+
+class Study(Struct, frozen=True, forbid_unknown_fields=True):
+    """A configuration file."""
+
+    title: str
+    grids: Annotated[list[Grid], Meta(min_length=1)]
+
+
+class Place(Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a cell stands in a grid.
+
+    ``data`` is a key of ``Results.data``; ``varied`` holds the values of the options that vary.
+    """
+
+    grid: str
+    cell: str
+    data: str
+    split: Kind
+    backbone: str
+    method: str
+    seed: int
+    varied: dict[str, Value]
+
+
+class Results(Struct, frozen=True, forbid_unknown_fields=True):
+    """What ``results.json`` holds: no path but those that the configuration names itself.
+
+    Seconds and milliseconds are of the machine; all else is the same wherever cells were run.
+    ``data``: name of each data set -> as the configuration has it; two of one name are told apart
+    by all of it. ``timing`` by name of the grid, of its first data set; milliseconds by cell.
+    """
+
+    title: str
+    confidence: float
+    study: Study
+    data: dict[str, str]
+    places: list[Place]
+    cells: dict[str, Cell]
+    timing: dict[str, Timing]
+    versions: dict[str, str]
+
+
+class _Plan(Struct):
+    """The cells of a study by name: their configurations and the noises each is evaluated with.
+
+    ``labels`` of the data sets, by their text.
+    """
+
+    labels: dict[str, str]
+    places: list[Place]
+    configs: dict[str, TrainConfig]
+    noises: dict[str, list[str]]
+
+
+def read_study(path: Path) -> Study:
+    """Read a configuration; raises UsageError where it is none."""
+    try:
+        return msgspec.convert(tomllib.loads(path.read_text("utf-8-sig")), Study)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        # Of TOML, of its encoding, or of what it says.
+        raise UsageError(f"{path}: expected a study, found {error}") from None
+
+
+def run_study(
+    study: Study, folder: CellFolder, engine: Engine, progress: Progress, say: Say
+) -> Results:
+    """Run the cells that are missing, time what is to be timed, and write ``results.json``.
+
+    Raises UsageError before anything is run for a grid that cannot be, and for finished cells that
+    are of other data or weights; else as ``CellFolder.fill`` does, after all other cells have been
+    run.
+    """
+    opened = {text: open_dataset(expanded(text)) for grid in study.grids for text in grid.data}
+    for dataset in opened.values():
+        say(summary(dataset))
+    plan = _plan(study, opened)
+    _check_networks(plan.configs.values())
+    folder.check_data(plan.configs)
+    cells = folder.fill(plan.configs, plan.noises, engine, progress, say)
+    results = Results(
+        title=study.title,
+        confidence=CONFIDENCE,
+        study=study,
+        data={label: text for text, label in plan.labels.items()},
+        places=plan.places,
+        cells=cells,
+        timing={
+            grid.name: _timing(grid, plan, cells, folder, opened[grid.data[0]])
+            for grid in study.grids
+            if not grid.vary
+        },
+        versions=versions(("cvo-edge", "cvo-export", "torch", "timm", "onnx", "scikit-learn")),
+    )
+    write_json(folder.out / RESULTS_FILE, results)
+    return results
+
+
+def expanded(text: str) -> str:
+    """Replace variables of the environment; raises UsageError where one is not set."""
+    found = os.path.expandvars(text)
+    if (unset := re.search(r"\$\{?(\w+)", found)) is not None:
+        raise UsageError(f"study: expected the variable {unset[1]} to be set, found {text!r}")
+    return found
+
+
+def _plan(study: Study, opened: Mapping[str, PoseDataset]) -> _Plan:
+    plan = _Plan(_labels(opened), [], {}, {})
+    names = [_file_safe(grid.name).lower() for grid in study.grids]
+    if len(set(names)) < len(names):
+        raise UsageError(
+            "study: expected a name of its own for every grid, in letters and digits alone, found "
+            + ", ".join(grid.name for grid in study.grids)
+        )
+    for grid in study.grids:
+        try:
+            _add(plan, grid, opened)
+        except UsageError as error:
+            raise UsageError(f"grid {grid.name}: {error}") from None
+    return plan
+
+
+def _add(plan: _Plan, grid: Grid, opened: Mapping[str, PoseDataset]) -> None:
+    """Add the cells of a grid."""
+    noises = [str(parse_noise(text)) for text in grid.noises]
+    lists: dict[str, Sequence[Value]] = {
+        "data": grid.data,
+        "methods": grid.methods,
+        "backbones": grid.backbones,
+        "noises": noises,
+        **grid.vary,
+    }
+    for name, values in lists.items():
+        if len(set(values)) < len(values):
+            raise UsageError(f"{name}: expected each once, found {values}")
+    combinations = [dict(zip(grid.vary, v, strict=True)) for v in product(*grid.vary.values())]
+    for data, backbone, method, varied, seed in product(
+        grid.data, grid.backbones, grid.methods, combinations, range(grid.seeds)
+    ):
+        dataset = opened[data]
+        split = grid.split or default_kind(dataset)
+        config = _config(grid, data, split, backbone, method, varied, seed)
+        check_roles(config, dataset)
+        name = _cell_name(config, data, grid.weights, dataset.name)
+        plan.configs[name] = config
+        known = plan.noises.setdefault(name, [])
+        known += [noise for noise in noises if noise not in known]
+        plan.places.append(
+            Place(grid.name, name, plan.labels[data], split, backbone, method, seed, varied)
+        )
+
+
+def _check_networks(configs: Iterable[TrainConfig]) -> None:
+    """Raise UsageError for a backbone that cannot be built, or whose weights do not fit."""
+    distinct = {
+        msgspec.json.encode((c.backbone, c.height, c.width, c.weights)): c
+        for c in configs
+        # They would have to be fetched.
+        if c.weights != TIMM_WEIGHTS
+    }
+    for config in distinct.values():
+        load_weights(Backbone(config.backbone, config.height, config.width), config.weights)
+
+
+def _labels(opened: Mapping[str, PoseDataset]) -> dict[str, str]:
+    names = [dataset.name for dataset in opened.values()]
+    return {
+        text: dataset.name if names.count(dataset.name) == 1 else f"{dataset.name} ({text})"
+        for text, dataset in opened.items()
+    }
+
+
+def _config(
+    grid: Grid,
+    data: str,
+    split: Kind,
+    backbone: str,
+    method: str,
+    varied: Mapping[str, Value],
+    seed: int,
+) -> TrainConfig:
+    network: dict[str, Any] = {"stages": grid.stages, "grid": grid.grid, "share": None}
+    network |= {key: value for key, value in varied.items() if key in _OF_THE_NETWORK}
+    for name in ("stages", "grid"):
+        if not isinstance(network[name], str):
+            raise UsageError(f"{name}: expected text, found {network[name]!r}")
+    share = network["share"]
+    if share is not None:
+        if isinstance(share, str) or not 0.0 < share <= 1.0:
+            raise UsageError(f"share: expected above 0, at most 1, found {share!r}")
+        network["share"] = float(share)
+    return configure(
+        method=method,
+        dataset=expanded(data),
+        split=split,
+        seed=seed,
+        size=grid.size,
+        crop="none",
+        backbone=backbone,
+        weights=expanded(grid.weights),
+        normalisation=None,
+        head={key: value for key, value in varied.items() if key not in _OF_THE_NETWORK},
+        copies=grid.copies,
+        steps=grid.steps,
+        fine_tune=grid.fine_tune,
+        **network,
+    )
+
+
+def _cell_name(config: TrainConfig, data: str, weights: str, dataset_name: str) -> str:
+    """Name of a cell, the same wherever its data and weights are."""
+    decisive = {**msgspec.to_builtins(config), "dataset": data, "weights": weights}
+    digest = hashlib.sha256(msgspec.json.encode(decisive)).hexdigest()[:8]
+    words = (dataset_name, config.split, config.backbone.name, config.method, str(config.seed))
+    return "-".join(_file_safe(word) for word in (*words, digest))
+
+
+def _timing(
+    grid: Grid,
+    plan: _Plan,
+    cells: Mapping[str, Cell],
+    folder: CellFolder,
+    dataset: PoseDataset,
+) -> Timing:
+    """Time the bundles of seed 0 of a grid on its first data set."""
+    first = (grid.name, plan.labels[grid.data[0]], 0)
+    names = [p.cell for p in plan.places if (p.grid, p.data, p.seed) == first]
+    bundles = {name: (cells[name].bundle, folder.bundle(name)) for name in names}
+    return timed(folder.out / f"timing-{_file_safe(grid.name)}.json", bundles, dataset)
+
+
+def _file_safe(text: str) -> str:
+    return re.sub(r"[^\w.]+", "_", text)

@@ -1,0 +1,116 @@
+"""Tasks on a Ray cluster: the same as ``workers.run_tasks``, on as many machines as it has.
+
+All machines see the folders of the study under the same paths, and have the same packages.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from cvo_edge.errors import CvoError, UsageError
+from cvo_export.study.workers import Ended, Engine, Task, TaskError, attempt
+
+# A task whose process or machine dies is run again, from its checkpoints, so many times.
+_RETRIES = 3
+
+
+# Connecting to an address that nobody listens at takes Ray minutes.
+_SECONDS_TO_CONNECT = 5.0
+
+
+@contextmanager
+def ray_engine() -> Iterator[Engine]:
+    """Join the cluster that ``RAY_ADDRESS`` names or that was started on this machine.
+
+    Yields what runs tasks by name, one a core; one that fails does not keep the others from
+    running.
+
+    Raises UsageError where ray is not installed or there is no cluster.
+    """
+    _take_the_heads_side()
+    try:
+        import ray
+    except ImportError:
+        raise UsageError('study: expected ray, found none; pip install "cvo-export[ray]"') from None
+    address = _address()
+    if address is None or not _listening(address):
+        raise UsageError(
+            f"study: expected a Ray cluster at {address or 'any address'}, found none; start one "
+            "with ray start --head, or name it in RAY_ADDRESS as HOST:PORT"
+        )
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        # Tasks say themselves what they have to say.
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        # It puts its own in their place, with another exit code.
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        line = next(iter(str(error).splitlines()), type(error).__name__)
+        raise UsageError(f"study: expected a Ray cluster at {address}, found {line}") from None
+    try:
+        yield partial(_run, ray)
+    finally:
+        ray.shutdown()
+
+
+def _take_the_heads_side() -> None:
+    """Use a token where ``ray start`` does: where its user has one, unless told otherwise.
+
+    Ray reads the variable when it is imported.
+    """
+    kept = Path("~/.ray/auth_token").expanduser()
+    named = "RAY_AUTH_TOKEN" in os.environ or "RAY_AUTH_TOKEN_PATH" in os.environ
+    if "RAY_AUTH_MODE" not in os.environ and (named or kept.exists()):
+        os.environ["RAY_AUTH_MODE"] = "token"
+
+
+def _address() -> str | None:
+    """HOST:PORT of a cluster: as the environment names it, else of this machine's last head."""
+    named = os.environ.get("RAY_ADDRESS", "auto")
+    if named != "auto":
+        return named
+    found = Path(os.environ.get("RAY_TMPDIR", "/tmp")) / "ray" / "ray_current_cluster"  # noqa: S108
+    try:
+        return found.read_text("utf-8").strip() or None
+    except OSError:
+        return None
+
+
+def _listening(address: str) -> bool:
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), _SECONDS_TO_CONNECT).close()
+    except (OSError, ValueError, OverflowError):
+        return False
+    return True
+
+
+def _run(ray: Any, tasks: Mapping[str, Task], ended: Ended) -> None:  # noqa: ANN401 - untyped
+    remote = ray.remote(num_cpus=1, max_retries=_RETRIES)(_on_a_worker)
+    running = {remote.remote(task, Path.cwd()): name for name, task in tasks.items()}
+    while running:
+        (reference, *_), _ = ray.wait(list(running), num_returns=1)
+        try:
+            found: CvoError | None = ray.get(reference)
+        except ray.exceptions.RayError as error:
+            found = TaskError(f"its worker was lost: {' '.join(str(error).split())[:200]}")
+        ended(running.pop(reference), found)
+
+
+def _on_a_worker(task: Task, folder: Path) -> CvoError | None:
+    import torch
+
+    torch.set_num_threads(1)
+    # Relative paths of data and weights mean the same as where the study was started.
+    with suppress(OSError):
+        os.chdir(folder)
+    return attempt(task)

@@ -1,0 +1,1 @@
+"""Training: configuration, features, the loop and its run folder."""

@@ -1,0 +1,91 @@
+"""Options of the command line -> a ``TrainConfig``, with what depends on the data filled in."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any, cast
+
+import msgspec
+
+from cvo_edge.errors import UsageError
+from cvo_edge.input.preprocess import Crop
+from cvo_export.data.augment import AugmentConfig
+from cvo_export.data.splits import Kind, default_kind
+from cvo_export.datasets import open_dataset
+from cvo_export.networks.backbone import NO_WEIGHTS, TIMM_WEIGHTS, BackboneConfig, Normalisation
+from cvo_export.networks.methods import TRAINABLE, TrainableConfig
+from cvo_export.training.run import TrainConfig
+
+
+def configure(
+    *,
+    method: str,
+    dataset: str,
+    split: Kind | None,
+    seed: int,
+    size: str,
+    crop: Crop,
+    backbone: str,
+    weights: str,
+    stages: str,
+    grid: str,
+    normalisation: Normalisation | None,
+    head: dict[str, Any],
+    **given: float | None,
+) -> TrainConfig:
+    """Fill in the defaults; ``given`` are TrainConfig's numbers, ``head`` the method's options.
+
+    None stands for the default of each. Raises UsageError for texts that are not of their form, and
+    for an option that belongs to another method.
+    """
+    width, height = _pair(size, "size", "WIDTHxHEIGHT")
+    if min(width, height) < 32 or max(width, height) > 4096:
+        raise UsageError(f"size: expected 32 to 4096 pixels, found {size}")
+    if normalisation is None:
+        normalisation = "timm" if weights in (TIMM_WEIGHTS, NO_WEIGHTS) else "half"
+    numbers: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    augment = {key: numbers.pop(key) for key in ("rotation_deg", "light") if key in numbers}
+    kind = split or default_kind(open_dataset(dataset))
+    return TrainConfig(
+        dataset=dataset,
+        split=kind,
+        seed=seed,
+        height=height,
+        width=width,
+        crop=crop,
+        backbone=BackboneConfig(
+            backbone, tuple(stages.split(",")), _pair(grid, "grid", "ROWSxCOLUMNS"), normalisation
+        ),
+        weights=weights,
+        augment=AugmentConfig(**augment),
+        head=_head_config(method, head),
+        **numbers,
+    )
+
+
+def _head_config(method: str, options: dict[str, Any]) -> TrainableConfig:
+    if method not in TRAINABLE:
+        raise UsageError(f"method: expected one of {', '.join(TRAINABLE)}, found {method}")
+    kind = TRAINABLE[method].config
+    given = {name: value for name, value in options.items() if value is not None}
+    for name, value in given.items():
+        shown = name.replace("_", "-")
+        if name not in kind.__struct_fields__:
+            raise UsageError(
+                f"{shown}: expected an option of {method} "
+                f"({', '.join(kind.__struct_fields__).replace('_', '-')}), found none of it"
+            )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise UsageError(f"{shown}: expected a finite number, found {value}")
+    try:
+        return cast("TrainableConfig", msgspec.convert({"method": method, **given}, kind))
+    except msgspec.ValidationError as error:
+        raise UsageError(str(error)) from None
+
+
+def _pair(text: str, what: str, form: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
+    if match is None:
+        raise UsageError(f"{what}: expected {form}, found {text!r}")
+    return int(match[1]), int(match[2])

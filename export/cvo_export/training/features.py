@@ -1,0 +1,167 @@
+"""What the heads are trained on: cached features of augmented copies, or fresh images.
+
+The frozen network's features are computed by its own exported graph through the runtime: several
+times faster than torch on a CPU, and exactly what the device will compute.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from threading import Lock
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cvo_edge.cores import allowed_cores
+from cvo_edge.engine.session import Session
+from cvo_edge.errors import SinkError, SourceError
+from cvo_edge.input import preprocess
+from cvo_export.data.augment import AugmentConfig, augmented, model_intrinsics
+from cvo_export.datasets import PoseDataset
+from cvo_export.graph.to_onnx import export_onnx
+from cvo_export.networks.backbone import Backbone
+from cvo_export.progress import Progress
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+
+class ModelImages:
+    """Frames of a data set as the model sees them: (height, width, 3) uint8 RGB, kept in memory."""
+
+    def __init__(
+        self,
+        dataset: PoseDataset,
+        indices: NDArray[np.int64],
+        height: int,
+        width: int,
+        crop: preprocess.Crop,
+    ) -> None:
+        self.poses = dataset.poses[indices]
+        self.images = np.empty((indices.size, height, width, 3), dtype=np.uint8)
+        self.K: Array | None = None
+        for row, index in enumerate(indices.tolist()):
+            image = preprocess.to_bgr8(dataset.read_image(index))
+            if image is None:
+                raise SourceError(f"{dataset.frame_names[index]}: expected a colour image")
+            self.images[row] = preprocess.model_input(image, height, width, crop)[0]
+            if self.K is None and dataset.intrinsics is not None:
+                self.K = model_intrinsics(dataset.intrinsics, image.shape, height, width, crop)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def digest(self) -> str:
+        """sha256 of all pixels."""
+        return hashlib.sha256(self.images.tobytes()).hexdigest()
+
+    def augmented(
+        self, row: int, config: AugmentConfig, generator: np.random.Generator
+    ) -> tuple[Image, Array]:
+        """Return a changed copy of one image and its exact pose (7,)."""
+        return augmented(self.images[row], self.poses[row], self.K, config, generator)
+
+
+class FeatureExtractor:
+    """Images (height, width, 3) uint8 RGB -> features (size,), by the exported backbone.
+
+    Exported when the first image comes: where all features are at hand, none does.
+    """
+
+    def __init__(self, backbone: Backbone, height: int, width: int) -> None:
+        self._backbone = backbone
+        self._blank = torch.zeros((1, height, width, 3), dtype=torch.uint8)
+        self._session: Session | None = None
+        self._exporting = Lock()
+
+    def __call__(self, image: Image) -> NDArray[np.float32]:
+        """Return the features of one image."""
+        with self._exporting:
+            if self._session is None:
+                content = export_onnx(self._backbone, [self._blank], ["image"], ["features"])
+                # One thread each: several images at a time need no waiting for one another.
+                self._session = Session(content, threads=1)
+        return np.asarray(self._session.run({"image": image[np.newaxis]})["features"][0])
+
+
+def cached_features(
+    folder: Path, images: ModelImages, extractor: FeatureExtractor
+) -> NDArray[np.float32]:
+    """Features (n, size) of images as they are, kept in a file named for their pixels."""
+    path = folder / f"frames-{images.digest()[:24]}.npz"
+    found = _stored(path, len(images))
+    if found is None:
+        found = {"features": np.stack([extractor(image) for image in images.images])}
+        _store(path, found)
+    return found["features"]
+
+
+def cached_copies(
+    folder: Path,
+    images: ModelImages,
+    extractor: FeatureExtractor,
+    config: AugmentConfig,
+    copies: int,
+    seed: int,
+    progress: Progress,
+) -> tuple[NDArray[np.float16], Array]:
+    """Features (copies + 1, n, size) and poses (copies + 1, n, 7); the first is unchanged.
+
+    One file a copy, written whole or not at all, so that an interrupted run goes on with the next.
+    """
+    features, poses = [], []
+    for number in range(copies + 1):
+        path = folder / f"copy-{number:03d}.npz"
+        found = _stored(path, len(images))
+        if found is None:
+            graded = config.graded(number / max(1, copies))
+            found = _one_copy(images, extractor, graded, (seed, number))
+            _store(path, found)
+        features.append(found["features"])
+        poses.append(found["poses"])
+        progress("features", number + 1, copies + 1)
+    return np.stack(features), np.stack(poses)
+
+
+def _stored(path: Path, count: int) -> dict[str, NDArray[Any]] | None:
+    """Arrays of ``count`` rows each, or None where there are none, or no whole ones."""
+    try:
+        with np.load(path) as stored:
+            arrays = dict(stored)
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return None
+    return arrays if {len(array) for array in arrays.values()} == {count} else None
+
+
+def _store(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """Write under a name of its own first: another run may be writing the same file."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with NamedTemporaryFile(dir=path.parent, suffix=".partial", delete=False) as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+        Path(stream.name).replace(path)
+    except OSError as error:
+        raise SinkError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _one_copy(
+    images: ModelImages, extractor: FeatureExtractor, config: AugmentConfig, seed: tuple[int, int]
+) -> dict[str, NDArray[Any]]:
+    def one(row: int) -> tuple[NDArray[np.float16], Array]:
+        # A generator of its own for each image: the result does not depend on the order.
+        image, pose = images.augmented(row, config, np.random.default_rng((*seed, row)))
+        return extractor(image).astype(np.float16), pose
+
+    # OpenCV and onnxruntime let other threads run, so whole images are the unit of work.
+    with ThreadPoolExecutor(max_workers=allowed_cores()) as pool:
+        found = list(pool.map(one, range(len(images))))
+    return {
+        "features": np.stack([features for features, _ in found]),
+        "poses": np.stack([pose for _, pose in found]),
+    }

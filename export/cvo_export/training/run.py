@@ -1,0 +1,232 @@
+"""A training run: its options, its folder, and what it learned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import msgspec
+import torch
+from msgspec import Meta
+from torch import Tensor, nn
+
+from cvo_edge.errors import SinkError, UsageError
+from cvo_edge.input.preprocess import Crop
+from cvo_export.data.augment import AugmentConfig
+from cvo_export.data.splits import Kind, Split, make_split, read_split_spec, same_split
+from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.networks.backbone import Backbone, BackboneConfig
+from cvo_export.networks.heads import ExportedHead, Setting
+from cvo_export.networks.methods import TRAINABLE, TrainableConfig
+from cvo_export.networks.standardised import Target
+
+CONFIG_FILE = "config.json"
+SPLIT_FILE = "split.json"
+NETWORK_FILE = "network.pt"
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides a run; written to ``config.json``.
+
+    Attributes
+    ----------
+    dataset, split, seed
+        What is trained on; the seed decides split, training and noise.
+    height, width, crop
+        The model's input and which part of an image it shows.
+    backbone, weights
+        The image network and where its weights come from (``timm``, ``none`` or a file).
+    augment, copies
+        How the augmented copies of each training frame are changed, and how many there are.
+    head
+        The method and its own options: the network behind the features and its loss.
+    steps, batch_size, learning_rate, weight_decay
+        AdamW on cached features; the rate rises over 50 steps and falls as a cosine.
+    warm_up_steps
+        Steps before the calibration term of the loss begins.
+    averaging
+        Decay of the running mean of the weights that is evaluated and kept.
+    fine_tune, backbone_learning_rate
+        Epochs in which the backbone learns, too, on fresh augmented images; the copies are then
+        computed anew and the head trained once more.
+    share
+        Of the training frames, how many are used: to see what a method needs.
+    """
+
+    dataset: str
+    split: Kind
+    head: TrainableConfig
+    seed: int = 0
+    height: int = 192
+    width: int = 256
+    crop: Crop = "none"
+    backbone: BackboneConfig = field(default_factory=BackboneConfig)
+    weights: str = "timm"
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    copies: int = 48
+    steps: int = 10_000
+    warm_up_steps: int = 200
+    batch_size: int = 64
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-3
+    averaging: float = 0.995
+    fine_tune: int = 0
+    backbone_learning_rate: float = 3e-4
+    share: Annotated[float, Meta(gt=0, le=1)] = 1.0
+
+    @property
+    def method(self) -> str:
+        """Name of the method or baseline, the tag of its options."""
+        return str(self.head.__struct_config__.tag)
+
+
+class History(NamedTuple):
+    """One evaluation on val."""
+
+    lesson: str
+    phase: int
+    step: int
+    loss: float
+    val_score: float
+
+
+class PoseGraph(nn.Module):
+    """What is exported: images (n, height, width, 3), uint8 RGB -> the method's outputs."""
+
+    def __init__(self, backbone: Backbone, head: ExportedHead) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.head = head
+
+    def forward(self, image: Tensor, *extra: Tensor) -> tuple[Tensor, ...]:
+        """Return the head's outputs, of the names in ``head.output_names``."""
+        outputs: tuple[Tensor, ...] = self.head(self.backbone(image), *extra)
+        return outputs
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run: what it was asked for, what it learned, and how that went."""
+
+    config: TrainConfig
+    dataset: PoseDataset
+    split: Split
+    target: Target
+    graph: PoseGraph
+    weights_sha256: str | None
+    history: list[History]
+
+    def save(self, run_dir: Path) -> None:
+        """Write what training learned, whole or not at all."""
+        target = (self.target.reference_q_xyzw, self.target.mean, self.target.std)
+        partial = run_dir / (NETWORK_FILE + ".partial")
+        torch.save(
+            {
+                "backbone": self.graph.backbone.state_dict(),
+                "head": self.graph.head.state_dict(),
+                "target": [torch.from_numpy(values) for values in target],
+                "weights_sha256": self.weights_sha256,
+                "history": [tuple(entry) for entry in self.history],
+            },
+            partial,
+        )
+        partial.replace(run_dir / NETWORK_FILE)
+
+    @property
+    def best(self) -> History:
+        """The evaluation of the weights that were kept, of all networks that val chose among.
+
+        Networks of other folds are no candidates, nor are models of residuals.
+        """
+        last_phase = max(entry.phase for entry in self.history)
+        return min(
+            (
+                entry
+                for entry in self.history
+                if entry.phase == last_phase
+                and not any(part in entry.lesson for part in ("-fold", "-region"))
+            ),
+            key=lambda entry: entry.val_score,
+        )
+
+    def lines(self) -> list[str]:
+        """Return what was trained as lines of text for a person."""
+        counts = ", ".join(f"{role} {indices.size}" for role, indices in self.split.roles.items())
+        best = self.best
+        parameters = sum(parameter.numel() for parameter in self.graph.parameters())
+        return [
+            f"split       {self.split.kind}: {counts}",
+            f"network     {self.config.backbone.name}, {parameters / 1e6:.2f} M parameters",
+            f"best        val score {best.val_score:.3f} at step {best.step} ({best.lesson})",
+        ]
+
+
+def open_run(run_dir: Path, config: TrainConfig) -> tuple[PoseDataset, Split]:
+    """Open the data set of a configuration and make its split; nothing is written yet.
+
+    Raises UsageError where the folder belongs to another configuration.
+    """
+    path = run_dir / CONFIG_FILE
+    if run_dir.exists() and not run_dir.is_dir():
+        raise SinkError(f"{run_dir}: expected a folder, found a file")
+    if path.is_file() and path.read_bytes() != _encoded(config):
+        raise UsageError(
+            f"{run_dir}: expected a new folder or a run of the same options, found another run"
+        )
+    dataset = open_dataset(config.dataset)
+    return dataset, make_split(dataset, config.split, config.seed)
+
+
+def claim_run(run_dir: Path, config: TrainConfig, dataset: PoseDataset, split: Split) -> None:
+    """Write configuration and split, once everything that may be refused has been tried.
+
+    Raises SinkError where the folder cannot be written.
+    """
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        split.write(run_dir / SPLIT_FILE, dataset)
+        partial = run_dir / (CONFIG_FILE + ".partial")
+        partial.write_bytes(_encoded(config))
+        partial.replace(run_dir / CONFIG_FILE)
+    except OSError as error:
+        raise SinkError(f"{run_dir}: cannot be written: {error.strerror}") from None
+
+
+def _encoded(config: TrainConfig) -> bytes:
+    return msgspec.json.format(msgspec.json.encode(config), indent=1)
+
+
+def load_run(run_dir: Path, dataset: str | None = None) -> Run:
+    """Read a finished run; ``dataset`` says where its data set is now, if it has moved.
+
+    Raises UsageError where the folder holds no finished run, SourceError where the data set is not
+    the one that was split.
+    """
+    path = run_dir / NETWORK_FILE
+    if not path.is_file():
+        raise UsageError(f"{run_dir}: expected a finished run, found no {NETWORK_FILE}")
+    try:
+        config = msgspec.json.decode((run_dir / CONFIG_FILE).read_bytes(), type=TrainConfig)
+        recorded = read_split_spec(run_dir / SPLIT_FILE)
+        stored = torch.load(path, weights_only=True)
+    # torch.load raises what its unpickler and its zip reader happen to raise.
+    except Exception as error:  # noqa: BLE001
+        line = " ".join(str(error).split())[:120]
+        raise UsageError(f"{run_dir}: expected the files of a finished run, found {line}") from None
+    opened = open_dataset(dataset or config.dataset)
+    split = same_split(opened, recorded)
+    target = Target(*(values.numpy() for values in stored["target"]))
+    backbone = Backbone(config.backbone, config.height, config.width)
+    setting = Setting(backbone.size, target, config.seed)
+    try:
+        backbone.load_state_dict(stored["backbone"])
+        head = TRAINABLE[config.method].restore(setting, config.head, stored["head"])
+    except RuntimeError:
+        raise UsageError(
+            f"{run_dir}: expected a network of this release, found other tensors in {NETWORK_FILE}"
+        ) from None
+    graph = PoseGraph(backbone, head).eval()
+    history = [History(*entry) for entry in stored["history"]]
+    return Run(config, opened, split, target, graph, stored["weights_sha256"], history)

@@ -1,0 +1,255 @@
+"""How streams use the cores: order, errors in their place, the newest frame."""
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from cvo_edge import Frame, Odometer, Reason, SourceError, UsageError, open_source
+from cvo_edge.input.capture import READER
+from cvo_edge.scheduling import Mode, Newest, Played, in_order, plan
+
+
+def test_each_mode_uses_as_many_threads_as_it_is_given():
+    for mode in Mode:
+        settings = plan(mode, 2)
+        assert settings.threads * settings.workers == 2
+    assert plan(Mode.THROUGHPUT, 3).threads == 1
+    with pytest.raises(UsageError, match="threads: expected 1 to 64, found 0"):
+        plan(Mode.THROUGHPUT, 0)
+
+
+def test_results_come_in_the_order_of_their_tasks():
+    delays = np.random.default_rng(0).uniform(0.0, 0.004, 60)
+
+    def task(number):
+        time.sleep(delays[number])
+        return number
+
+    tasks = (lambda number=number: task(number) for number in range(60))
+    assert list(in_order(tasks, 3)) == list(range(60))
+
+
+def test_few_tasks_are_under_way_and_none_after_the_last_one_wanted():
+    taken = []
+
+    def tasks():
+        for number in range(1000):
+            taken.append(number)
+            yield lambda number=number: number
+
+    results = in_order(tasks(), 2)
+    assert [next(results) for _ in range(5)] == list(range(5))
+    assert len(taken) <= 5 + 2 + 2
+    results.close()
+    assert len(taken) <= 5 + 2 + 2
+
+
+def test_an_error_comes_in_its_place():
+    def fails():
+        raise ValueError("third")
+
+    def ending(error):
+        yield from (lambda: 1, lambda: 2)
+        raise error
+
+    results = in_order([lambda: 1, lambda: 2, fails, lambda: 4], 2)
+    assert [next(results), next(results)] == [1, 2]
+    with pytest.raises(ValueError, match="third"):
+        next(results)
+    for error in (SourceError("ended early"), KeyError("ended early")):
+        results = in_order(ending(error), 2)
+        assert [next(results), next(results)] == [1, 2]
+        with pytest.raises(type(error), match="ended early"):
+            next(results)
+
+
+def picture_free(number):
+    return Frame(None, number * 1_000_000, str(number), 0.0)
+
+
+class Stepping:
+    """Frames that come when a test says so; ``asked`` counts how many were asked for."""
+
+    def __init__(self, count, failure=None):
+        self.go, self.asked, self._count, self._failure = threading.Semaphore(0), 0, count, failure
+
+    def __iter__(self):
+        for number in range(self._count):
+            self.asked += 1
+            self.go.acquire()
+            yield picture_free(number)
+        self.asked += 1
+        if self._failure:
+            raise self._failure
+
+    def give(self, count):
+        """Let so many frames come, and wait until they have been taken."""
+        expected = self.asked + count
+        self.go.release(count)
+        self.wait(expected)
+
+    def wait(self, asked):
+        """Wait until so many frames have been asked for."""
+        deadline = time.monotonic() + 30
+        while self.asked < asked and time.monotonic() < deadline:
+            time.sleep(0.001)
+        assert self.asked == asked
+
+
+FAILURES = [None, SourceError("camera 0: gave no frame after 6 frames"), SystemExit(3)]
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+def test_the_newest_frame_is_seen_and_the_others_are_counted(failure):
+    source = Stepping(6, failure)
+    newest = iter(Newest(source))
+    source.go.release()
+    assert next(newest).source == "0"
+    source.wait(2)
+    source.give(3)
+    frame = next(newest)
+    assert (frame.source, frame.skipped) == ("3", 2)
+    assert frame.waited_ms > 0.0
+    source.give(2)
+    frame = next(newest)
+    assert (frame.source, frame.skipped) == ("5", 1)
+    with pytest.raises(type(failure) if failure else StopIteration):
+        next(newest)
+
+
+def test_files_are_played_no_faster_than_their_stamps():
+    begin = time.monotonic()
+    seen = list(Newest(Played(Recorded(4, step_ns=20_000_000))))
+    assert time.monotonic() - begin >= 0.06
+    assert seen[-1].source == "3"
+    assert sum(frame.skipped + 1 for frame in seen) == 4
+
+
+class Recorded:
+    """A recording without images."""
+
+    live = False
+
+    def __init__(self, length, step_ns):
+        self.length, self._step_ns = length, step_ns
+
+    def __iter__(self):
+        for number in range(self.length):
+            yield Frame(None, number * self._step_ns, str(number), 0.0)
+
+    def reads(self):
+        for frame in self:
+            yield lambda frame=frame: frame
+
+
+def readers():
+    return [thread for thread in threading.enumerate() if thread.name == READER]
+
+
+def test_nothing_reads_on_when_a_live_stream_is_left(bundle_dir):
+    with Odometer.load(bundle_dir, mode="live") as odometer:
+        for _ in odometer.stream(Recorded(3, step_ns=100 * 10**9)):
+            break
+    assert readers() == []
+
+
+def test_a_video_that_is_left_while_it_is_read_ends_the_process_as_ever(
+    bundle_dir, clip_dir, tmp_path
+):
+    # Large: most of the time the reader is inside of OpenCV.
+    frame = next(iter(open_source(str(clip_dir))))
+    path = tmp_path / "large.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (2560, 1920))
+    for _ in range(20):
+        writer.write(cv2.resize(frame.image, (2560, 1920)))
+    writer.release()
+    command = [sys.executable, "-c", "from cvo_edge.__main__ import main; main()", "run"]
+    arguments = [str(bundle_dir), str(path), "--mode", "live", "--max-frames", "2", "--quiet"]
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr, len(done.stdout.splitlines())) == (0, "", 2)
+
+
+def test_what_cannot_be_played_is_refused(bundle_dir, clip_dir):
+    odometer = Odometer.load(bundle_dir, mode="live")
+    with pytest.raises(UsageError, match="expected a camera, or frames with stamps"):
+        list(odometer.stream(open_source(str(clip_dir))))
+    with pytest.raises(UsageError, match="mode: expected one of live, latency, throughput"):
+        Odometer.load(bundle_dir, mode="fast")
+
+
+def intervals(estimates):
+    return {
+        estimate.source: (estimate.seq, estimate.lower.tolist(), estimate.upper.tolist())
+        for estimate in estimates
+    }
+
+
+def test_every_mode_gives_the_same_numbers(bundle_dir, clip_dir):
+    found = {}
+    for mode in Mode:
+        with Odometer.load(bundle_dir, mode=mode, threads=2) as odometer:
+            found[mode] = list(odometer.stream(open_source(str(clip_dir), fps=100)))
+    latency, throughput = (intervals(found[mode]) for mode in (Mode.LATENCY, Mode.THROUGHPUT))
+    assert list(throughput.items()) == list(latency.items())
+    # Where a frame takes seconds, the one that has waited for it is old by then.
+    live = [each for each in found[Mode.LIVE] if each.reasons != (Reason.FRAME_STALE,)]
+    assert live
+    assert intervals(live).items() <= latency.items()
+    numbers = [each.seq for each in found[Mode.LIVE]]
+    assert all(a < b for a, b in pairwise(numbers))
+    assert numbers[-1] == 49  # the last one is never left out
+
+
+def test_a_caller_may_write_the_next_image_into_the_same_memory(bundle_dir, clip_dir):
+    images = [frame.image for frame in list(open_source(str(clip_dir)))[:12]]
+
+    def refilled():
+        memory = np.empty_like(images[0])
+        for image in images:
+            np.copyto(memory, image)
+            yield memory
+
+    found = {}
+    for mode in (Mode.LATENCY, Mode.THROUGHPUT):
+        with Odometer.load(bundle_dir, mode=mode, threads=2) as odometer:
+            found[mode] = [estimate.lower.tolist() for estimate in odometer.stream(refilled())]
+    assert found[Mode.THROUGHPUT] == found[Mode.LATENCY]
+
+
+@pytest.mark.parametrize("mode", [Mode.LATENCY, Mode.THROUGHPUT])
+def test_numbers_go_on_where_a_stream_was_left(bundle_dir, clip_dir, mode):
+    with Odometer.load(bundle_dir, mode=mode, threads=2) as odometer:
+        for _ in range(2):
+            stream = odometer.stream(open_source(str(clip_dir)))
+            first = [next(stream).seq, next(stream).seq]
+            stream.close()
+        assert first == [2, 3]
+        assert odometer.step(None).seq == 4
+
+
+def test_a_mode_on_the_command_line(bundle_dir, clip_dir):
+    command = [sys.executable, "-c", "from cvo_edge.__main__ import main; main()", "run"]
+    outputs = {}
+    for mode in ("latency", "throughput"):
+        arguments = [bundle_dir, clip_dir, "--mode", mode, "--max-frames", 7, "--format", "table"]
+        result = subprocess.run(
+            [*command, *map(str, arguments)], capture_output=True, text=True, check=True
+        )
+        outputs[mode] = result.stdout
+    assert outputs["latency"] == outputs["throughput"]
+    assert len(outputs["latency"].splitlines()) == 8
+    arguments = [bundle_dir, clip_dir, "--mode", "live", "--fps", 1000]
+    result = subprocess.run(
+        [*command, *map(str, arguments)], capture_output=True, text=True, check=True
+    )
+    records = [json.loads(line) for line in result.stdout.splitlines()]
+    left_out = 50 - len(records)
+    assert records[-1]["seq"] == 49
+    assert (f"skipped     {left_out} frames" in result.stderr) == (left_out > 0)

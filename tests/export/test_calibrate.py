@@ -1,0 +1,273 @@
+"""A network that is already there: its own ONNX file, or the model of a bundle."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from cvo_edge import Odometer
+from cvo_edge.bundle.reading import read_bundle, read_calibration
+from cvo_edge.conformal import conformal_quantile
+from cvo_edge.errors import BundleMismatchError, CvoError, ModelError, SinkError, UsageError
+from cvo_edge.geometry import mean_rotation
+from cvo_edge.programs.inspect import inspect_lines
+from cvo_edge.programs.selftest import check_selftest
+from cvo_export.bundles.thresholds import observe
+from cvo_export.calibrate import recalibrate
+from cvo_export.cli import app
+from cvo_export.data.splits import same_split
+from cvo_export.datasets import open_dataset
+from cvo_export.evaluate import evaluate, find_level
+
+DATASET = "synthetic:room,flights=12,frames=20,size=64x48,seed=4"
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return open_dataset(DATASET)
+
+
+def own_model(dataset, bounds, height=48, width=64, outputs=("pose", "lower", "upper")):
+    """A small network of another workshop: the mean colour says where the camera is, roughly."""
+    generator = np.random.default_rng(0)
+    rotation = mean_rotation(dataset.poses[:, 3:]).astype(np.float32)
+    centre = dataset.poses[:, :3].mean(axis=0).astype(np.float32)
+    constants = {
+        "slope": generator.normal(0.0, 2e-4, (3, 3)).astype(np.float32),
+        "centre": centre[None],
+        "rotation": rotation[None],
+        "axes": np.array([1, 2]),
+        "zeros": np.zeros((1, 3), np.float32),
+        "half": np.array([[0.3, 0.3, 0.1, 0.1, 0.2, 0.05]], np.float32),
+    }
+    nodes = [
+        helper.make_node("Cast", ["image"], ["float"], to=TensorProto.FLOAT),
+        helper.make_node("ReduceMean", ["float", "axes"], ["colour"], keepdims=0),
+        helper.make_node("MatMul", ["colour", "slope"], ["shift"]),
+        helper.make_node("Add", ["shift", "centre"], ["position"]),
+        helper.make_node("Concat", ["position", "rotation"], [outputs[0]], axis=1),
+    ]
+    shapes = {outputs[0]: [1, 7]}
+    if bounds:
+        nodes += [
+            helper.make_node("Concat", ["position", "zeros"], ["point"], axis=1),
+            helper.make_node("Sub", ["point", "half"], [outputs[1]]),
+            helper.make_node("Add", ["point", "half"], [outputs[2]]),
+        ]
+        shapes |= {outputs[1]: [1, 6], outputs[2]: [1, 6]}
+    graph = helper.make_graph(
+        nodes,
+        "own",
+        [helper.make_tensor_value_info("image", TensorProto.UINT8, [1, height, width, 3])],
+        [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in shapes.items()],
+        [numpy_helper.from_array(values, name) for name, values in constants.items()],
+    )
+    opsets = [helper.make_opsetid("", 18)]
+    return helper.make_model(graph, opset_imports=opsets, ir_version=10).SerializeToString()
+
+
+@pytest.fixture
+def model_file(dataset, tmp_path):
+    path = tmp_path / "own.onnx"
+    path.write_bytes(own_model(dataset, bounds=False))
+    return path
+
+
+def test_a_point_network_gets_order_statistics_of_its_residuals(model_file, dataset, tmp_path):
+    calibration = recalibrate(model_file, dataset, tmp_path / "b", "own", kind="random")
+    assert (calibration.method, calibration.calibration.score) == ("cqr", "residual")
+    split = same_split(dataset, calibration.calibration.split)
+    with Odometer.load(tmp_path / "b") as odometer:
+        check_selftest(odometer)
+        seen = observe(odometer, dataset, split.roles["cal"])
+    for dof in range(6):
+        expected = conformal_quantile(np.abs(seen.truth - seen.point)[:, dof], 0.9)
+        assert calibration.threshold(0.9, "marginal").q_hat[dof] == expected
+    level = find_level(evaluate(tmp_path / "b", dataset, "test")["levels"], 0.9, "marginal")
+    low, high = level["coverage_band"]
+    assert all(low <= share <= high for share in level["coverage"])
+
+
+@pytest.mark.parametrize("rotation", ["tangent_predicted", "euler_zyx"])
+def test_a_network_with_bounds_gets_the_scores_of_quantile_regression(dataset, tmp_path, rotation):
+    path = tmp_path / "own.onnx"
+    path.write_bytes(own_model(dataset, bounds=True))
+    calibration = recalibrate(
+        path, dataset, tmp_path / "b", "own", kind="random", rotation=rotation, score="additive"
+    )
+    assert calibration.calibration.score == "additive"
+    assert calibration.pose.rotation == rotation
+    level = find_level(evaluate(tmp_path / "b", dataset, "test")["levels"], 0.9, "marginal")
+    assert np.mean(level["coverage"]) > 0.8
+
+
+def test_sides_joint_scope_and_rule_are_those_asked_for(model_file, dataset, tmp_path):
+    calibration = recalibrate(
+        *(model_file, dataset, tmp_path / "b", "own"),
+        kind="sequence",
+        sides="asymmetric",
+        joint="bonferroni",
+        rule="hierarchical",
+    )
+    assert calibration.method_parameters["sides"] == "asymmetric"
+    assert calibration.calibration.joint == "bonferroni"
+    assert calibration.calibration.rule == "hierarchical"
+    # 8 sequences at 0.9, two-sided: not enough for a finite threshold.
+    assert calibration.threshold(0.9, "marginal").q_hat == (None,) * 6
+
+
+def test_few_frames_are_unbounded_and_said_to_be(model_file, tmp_path):
+    few = open_dataset("synthetic:room,flights=1,frames=12,size=64x48")
+    calibration = recalibrate(model_file, few, tmp_path / "b", "few", kind="random")
+    assert calibration.calibration.n == 8
+    assert calibration.threshold(0.8, "marginal").q_hat != (None,) * 6
+    assert calibration.threshold(0.9, "marginal").q_hat == (None,) * 6
+    lines = inspect_lines(calibration)
+    for scope in ("marginal", "joint"):
+        for confidence, needed in ((0.9, 9), (0.95, 19), (0.99, 99)):
+            said = f"needs at least {needed} calibration frames, has 8"
+            assert f"unbounded    at {confidence} {scope}: {said}" in lines
+
+
+def test_what_two_sides_and_bonferroni_would_need_is_said(model_file, dataset, tmp_path):
+    lines = inspect_lines(
+        recalibrate(
+            *(model_file, dataset, tmp_path / "b", "own"),
+            kind="random",
+            sides="asymmetric",
+            joint="bonferroni",
+        )
+    )
+    # 168 frames: each side at 0.995 needs 199; at a sixth of 0.05, half a side, 239.
+    assert "unbounded    at 0.99 marginal: needs at least 199 calibration frames, has 168" in lines
+    assert "unbounded    at 0.95 joint: needs at least 239 calibration frames, has 168" in lines
+
+
+def test_a_bundle_keeps_its_model_and_method_on_new_data(tiny_bundle, dataset, tmp_path):
+    before = read_bundle(tiny_bundle)
+    recalibrate(tiny_bundle, dataset, tmp_path / "b", "new site", kind="random", new_data=True)
+    after = read_bundle(tmp_path / "b")
+    assert after.model_bytes == before.model_bytes
+    assert after.calibration.method == before.calibration.method
+    assert after.calibration.calibration.split.purpose == "calibration"
+    assert after.calibration.calibration.dataset == dataset.name
+    assert after.calibration.thresholds != before.calibration.thresholds
+    assert after.calibration.provenance == before.calibration.provenance
+    old, new = before.calibration.pose.limits, after.calibration.pose.limits
+    assert all(a >= b for a, b in zip(old.lowest, new.lowest, strict=True))
+    assert all(a <= b for a, b in zip(old.highest, new.highest, strict=True))
+    level = find_level(evaluate(tmp_path / "b", dataset, "test")["levels"], 0.9, "marginal")
+    assert np.mean(level["coverage"]) > 0.8
+
+
+def test_on_the_runs_own_data_the_frames_it_trained_on_stay_out(tiny_bundle, tiny_run, tmp_path):
+    # The same val and cal as the run, so the same thresholds to the last bit.
+    before = read_calibration(tiny_bundle)
+    after = recalibrate(
+        tiny_bundle, tiny_run.dataset, tmp_path / "b", "again", score=before.calibration.score
+    )
+    assert after.thresholds == before.thresholds
+    assert after.calibration.split == before.calibration.split
+
+
+def test_other_frames_of_the_training_datas_name_need_a_word(tiny_bundle, tmp_path):
+    # Eight of the nine flights are those that the network was trained on.
+    superset = open_dataset("synthetic:room,flights=9,frames=40,size=64x48")
+    with pytest.raises(UsageError, match="--new-data"):
+        recalibrate(tiny_bundle, superset, tmp_path / "b", "leak", kind="random")
+    assert not (tmp_path / "b").exists()
+
+
+def test_the_run_is_remembered_when_a_bundle_comes_back_to_its_own_data(
+    tiny_bundle, tiny_run, dataset, tmp_path
+):
+    before = read_calibration(tiny_bundle)
+    recalibrate(tiny_bundle, dataset, tmp_path / "b", "away", kind="random", new_data=True)
+    after = recalibrate(
+        tmp_path / "b", tiny_run.dataset, tmp_path / "c", "home", score=before.calibration.score
+    )
+    assert after.calibration.split == before.calibration.split
+    assert after.calibration.n == before.calibration.n
+
+
+@pytest.mark.parametrize("given", [{"rotation": "euler_zyx"}, {"crop": "centre"}])
+def test_options_of_a_model_file_are_refused_with_a_bundle(tiny_bundle, dataset, tmp_path, given):
+    with pytest.raises(UsageError, match="expected with an ONNX file"):
+        recalibrate(tiny_bundle, dataset, tmp_path / "b", "b", **given)
+
+
+def test_a_split_is_not_asked_for_on_the_runs_own_data(tiny_bundle, tiny_run, tmp_path):
+    with pytest.raises(UsageError, match="whose own roles are used"):
+        recalibrate(tiny_bundle, tiny_run.dataset, tmp_path / "b", "b", kind="random")
+
+
+def test_a_network_is_calibrated_where_torch_is_not_installed(model_file, tmp_path):
+    program = (
+        "import sys\n"
+        "for name in ('torch', 'torchvision', 'timm', 'sklearn'):\n"
+        "    sys.modules[name] = None\n"
+        "from cvo_export.cli import main\n"
+        "main()\n"
+    )
+    arguments = ["calibrate", model_file, DATASET, tmp_path / "b", "--split", "random"]
+    found = subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr
+    assert "residual score" in found.stdout
+    assert read_calibration(tmp_path / "b").provenance.backbone is None
+
+
+@pytest.mark.parametrize(
+    ("content", "error", "match"),
+    [
+        (b"no model at all", ModelError, "expected an ONNX file, found something else"),
+        (None, ModelError, "expected an ONNX file or a bundle folder"),
+        ({"outputs": ("place", "lower", "upper")}, BundleMismatchError, "pose"),
+        ({"outputs": ("pose", "low", "high")}, BundleMismatchError, "found image uint8"),
+        ({"height": 8, "width": 8}, BundleMismatchError, "at least 16x16 pixels, found 8x8"),
+    ],
+)
+def test_what_is_no_such_model_is_refused(dataset, tmp_path, content, error, match):
+    path = tmp_path / "model.onnx"
+    if isinstance(content, dict):
+        content = own_model(dataset, bounds=True, **content)
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(error, match=match):
+        recalibrate(path, dataset, tmp_path / "b", "wrong")
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize(
+    ("extra", "code"),
+    [
+        (["--score", "aps"], 2),
+        (["--split", "block"], 2),
+        (["--sides", "sideways"], 2),
+    ],
+)
+def test_wrong_options_are_one_line_with_exit_code_two(model_file, tmp_path, extra, code):
+    few = "synthetic:room,flights=1,frames=12,size=64x48"
+    with pytest.raises(Exception) as caught:
+        app(
+            ["calibrate", str(model_file), few, str(tmp_path / "b"), *extra],
+            standalone_mode=False,
+        )
+    assert caught.value.exit_code == code
+    if isinstance(caught.value, CvoError):
+        assert "\n" not in str(caught.value)
+
+
+def test_a_folder_with_other_files_is_left_alone(model_file, dataset, tmp_path):
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "precious.txt").write_text("keep")
+    with pytest.raises(SinkError):
+        recalibrate(model_file, dataset, tmp_path / "b", "own")
+    with pytest.raises(UsageError, match="score"):
+        recalibrate(model_file, dataset, tmp_path / "c", "own", score="lac", kind="random")
