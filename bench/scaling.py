@@ -104,7 +104,7 @@ def confidences(count: int) -> dict[str, Any]:
         found = read_calibration(folder)
         read = perf_counter()
         for threshold in found.thresholds:
-            odometer.region(observation, threshold)
+            odometer.conformal_set(observation, threshold)
         read_ms.append(1e3 * (read - begin))
         sets_ms.append(1e3 * (perf_counter() - read))
     return {

@@ -212,9 +212,9 @@ def coverage(records: Records, chart: Chart, truth: Mapping[str, Array]) -> dict
     ``truth`` gives true poses (7,) by source; frames without one, or without a pose, do not count.
     """
     covered = []
-    for source, pose, region in zip(records.sources, records.poses, records.sets, strict=True):
+    for source, pose, each in zip(records.sources, records.poses, records.sets, strict=True):
         if source in truth and np.isfinite(pose).all():
-            covered.append(region.covers(chart.coordinates(truth[source], pose)))
+            covered.append(each.covers(chart.coordinates(truth[source], pose)))
     found = np.array(covered, dtype=np.bool_).reshape(-1, 6)
     return {
         "frames": len(found),

@@ -60,7 +60,7 @@ class PoseInterval:
         (no pose either). Remarks from the closed list ``Reason``.
     pose
         The point estimate, None where invalid.
-    region
+    conformal_set
         The conformal set; everything (infinite) unless the status is ``ok``.
     confidence, scope
         The stated probability, and whether it holds for each DoF (``marginal``) or for all six at
@@ -77,7 +77,7 @@ class PoseInterval:
     status: Status
     reasons: tuple[Reason, ...]
     pose: Pose | None
-    region: ConformalSet
+    conformal_set: ConformalSet
     confidence: float
     scope: Scope
     chart: Chart
@@ -86,20 +86,20 @@ class PoseInterval:
     @property
     def lower(self) -> Array:
         """Shape (6,): tx ty tz (m), three rotation numbers (rad); -inf where unbounded."""
-        return self.region.lower
+        return self.conformal_set.lower
 
     @property
     def upper(self) -> Array:
         """Shape (6,), as ``lower``; +inf where unbounded."""
-        return self.region.upper
+        return self.conformal_set.upper
 
     @property
     def bands(self) -> Bands | None:
         """Disjoint intervals per DoF, or None where the set is its hull."""
-        return self.region.bands
+        return self.conformal_set.bands
 
     def position_boxes(self) -> Array:
-        """Shape (boxes, 3, 2): the region of the position, as disjoint boxes [low, high], metres.
+        """Shape (boxes, 3, 2): the set of the position, as disjoint boxes [low, high], metres.
 
         The product of the bands of tx, ty and tz; a single box for a method without gaps. With the
         joint scope the true position lies in one of them with the stated probability.
@@ -119,7 +119,7 @@ class PoseInterval:
 
         Raises UsageError for an invalid frame: there is no set to ask.
         """
-        return self.region.covers(self._coordinates(pose))
+        return self.conformal_set.covers(self._coordinates(pose))
 
     def contains(self, pose: Pose | ArrayLike) -> bool:
         """Whether the set holds this pose in all six degrees of freedom at once.
@@ -127,7 +127,7 @@ class PoseInterval:
         In the joint scope of MCQR that is the region itself, which is smaller than its hull; else
         whether ``covers`` is true of all six, and the errors are its.
         """
-        return self.region.contains(self._coordinates(pose))
+        return self.conformal_set.contains(self._coordinates(pose))
 
     def _coordinates(self, pose: Pose | ArrayLike) -> Array:
         if self.pose is None:
@@ -165,7 +165,7 @@ class PoseInterval:
                 "bands": self.bands if bounded or self.bands is None else _null_bands(self.bands),
             }
         if region and interval is not None:
-            ellipsoids = self.region.ellipsoids
+            ellipsoids = self.conformal_set.ellipsoids
             interval["region"] = None if ellipsoids is None else ellipsoids.to_dict()
         return {
             "seq": self.seq,

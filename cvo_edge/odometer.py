@@ -313,8 +313,8 @@ class Odometer:
         concluded = perf_counter()
         fault, doubt = observation.fault, observation.doubt
         against = tuple(reason for reason in (doubt, fault) if reason is not None)
-        region = unbounded_set() if against else self.region(observation)
-        reasons = against or self._remarks(observation, region)
+        found = unbounded_set() if against else self.conformal_set(observation)
+        reasons = against or self._remarks(observation, found)
         end = perf_counter()
         estimate = PoseInterval(
             seq=seq,
@@ -323,7 +323,7 @@ class Odometer:
             status=Status.INVALID if fault else Status.DEGRADED if doubt else Status.OK,
             reasons=reasons,
             pose=None if fault else Pose(observation.pose[:3], observation.pose[3:]),
-            region=region,
+            conformal_set=found,
             confidence=self.confidence,
             scope=self.scope,
             chart=self.chart,
@@ -345,7 +345,9 @@ class Odometer:
             return estimate
         if estimate.status is Status.OK:
             # Remarks on bounds that are not given any more would say nothing.
-            return replace(estimate, status=Status.DEGRADED, reasons=doubts, region=unbounded_set())
+            return replace(
+                estimate, status=Status.DEGRADED, reasons=doubts, conformal_set=unbounded_set()
+            )
         return replace(estimate, reasons=(*estimate.reasons, *doubts))
 
     def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
@@ -405,9 +407,13 @@ class Odometer:
         """Whether sets are a region of all six degrees of freedom, not six sets."""
         return self.scope == "joint" and self.head.one_joint_score
 
-    def region(self, observation: Observation, threshold: Threshold | None = None) -> ConformalSet:
+    def conformal_set(
+        self, observation: Observation, threshold: Threshold | None = None
+    ) -> ConformalSet:
         """The conformal set of an observation, by default at the odometer's own threshold."""
-        return self.head.region(observation.outputs, observation.point, threshold or self.threshold)
+        return self.head.conformal_set(
+            observation.outputs, observation.point, threshold or self.threshold
+        )
 
     def _stored_threshold(self, confidence: float, scope: Scope) -> Threshold:
         threshold = self.calibration.threshold(confidence, scope)
@@ -419,9 +425,9 @@ class Odometer:
             )
         return threshold
 
-    def _remarks(self, observation: Observation, region: ConformalSet) -> tuple[Reason, ...]:
+    def _remarks(self, observation: Observation, found: ConformalSet) -> tuple[Reason, ...]:
         remarks: tuple[Reason, ...] = ()
-        if region.crossed:
+        if found.crossed:
             remarks += (Reason.BOUNDS_CROSSED,)
         if self.chart.rotation == "euler_zyx" and abs(observation.point[4]) > _STEEP_PITCH:
             remarks += (Reason.PITCH_NEAR_90,)

@@ -61,7 +61,7 @@ class Head(Protocol):
         Those of the joint scope are other ones where ``one_joint_score``.
         """
 
-    def region(
+    def conformal_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """The set {y : score(y) <= q_hat} of one frame; point (6,)."""

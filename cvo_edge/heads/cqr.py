@@ -163,7 +163,7 @@ class CqrHead:
         sides = self._score.sides(*self._interval(outputs, point), point, truth)
         return sides.max(axis=1, keepdims=True) if self._sides == "symmetric" else sides
 
-    def region(
+    def conformal_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Outputs of one frame, point (6,) -> its set; where it is empty, its middle."""

@@ -123,7 +123,7 @@ class CspHead:
             of_truth[:, dof] = np.where(inside, found, np.inf)
         return of_truth[:, np.newaxis]
 
-    def region(
+    def conformal_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Outputs of one frame -> its bands and their hull; point (6,) is not needed."""
@@ -152,10 +152,10 @@ class CspHead:
             bands=(*map(tuple, bands),),
         )
 
-    def classes_in(self, region: ConformalSet) -> NDArray[np.int64]:
+    def classes_in(self, conformal_set: ConformalSet) -> NDArray[np.int64]:
         """Return how many classes of each DoF a set of this head holds, (6,); all if unbounded."""
         counts = []
-        for edges, row in zip(self.parameters.edges, region.bands or (), strict=True):
+        for edges, row in zip(self.parameters.edges, conformal_set.bands or (), strict=True):
             ends = np.searchsorted(edges, np.clip(np.array(row), edges[0], edges[-1]))
             counts.append(int((ends[:, 1] - ends[:, 0]).sum()))
         return np.array(counts)

@@ -130,7 +130,7 @@ class McqrHead:
         sides = self._score.sides(lower, upper, 0.5 * (lower + upper), truth)
         return np.asarray(sides.max(axis=1, keepdims=True))
 
-    def region(
+    def conformal_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Outputs of one frame -> its region and hull, or six intervals; point is not needed."""

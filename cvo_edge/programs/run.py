@@ -56,7 +56,7 @@ class RunSummary:
         self.latency.add(estimate.latency_ms)
         if estimate.bounded:
             self.bounded += 1
-            self.width_sum += estimate.region.width()
+            self.width_sum += estimate.conformal_set.width()
             self.disjoint += any(len(row) > 1 for row in estimate.bands or ())
         if truth is not None and estimate.pose is not None:
             self.compared += 1

@@ -164,17 +164,17 @@ def point_error(seen: Observed) -> dict[str, float]:
     }
 
 
-def region_log_volume(region: ConformalSet, deviation: Array, seed: int) -> float:
+def set_log_volume(found: ConformalSet, deviation: Array, seed: int) -> float:
     """Logarithm of the volume in which all six degrees of freedom lie, in standardised units.
 
     The product of six sets, or a union of ellipsoids. ``deviation`` (6,): standard deviation of
     each degree of freedom's poses, m and rad; ``seed`` of the estimate, one for each frame. A set
     without width counts as a thousandth of the deviation: a single one would make all volumes 0.
     """
-    box = np.log(np.maximum(region.width() / deviation, _LEAST_WIDTH)).sum()
-    if region.ellipsoids is None:
+    box = np.log(np.maximum(found.width() / deviation, _LEAST_WIDTH)).sum()
+    if found.ellipsoids is None:
         return float(box)
-    ellipsoids = ellipsoids_log_volume(region.ellipsoids, seed) - np.log(deviation).sum()
+    ellipsoids = ellipsoids_log_volume(found.ellipsoids, seed) - np.log(deviation).sum()
     return float(min(ellipsoids, box))
 
 
@@ -361,14 +361,14 @@ class _Sets:
     def deviation(self) -> Array:
         return np.array(self.calibration.pose.standard_deviation)
 
-    def covered(self, regions: list[ConformalSet]) -> NDArray[np.bool_]:
+    def covered(self, sets: list[ConformalSet]) -> NDArray[np.bool_]:
         """Which true numbers lie in these sets, (n, 6)."""
-        return np.array([r.covers(y) for r, y in zip(regions, self.seen.truth, strict=True)])
+        return np.array([each.covers(y) for each, y in zip(sets, self.seen.truth, strict=True)])
 
-    def covered_jointly(self, regions: list[ConformalSet]) -> float:
+    def covered_jointly(self, sets: list[ConformalSet]) -> float:
         """Share of frames whose true numbers lie in these sets all six at once."""
-        pairs = zip(regions, self.seen.truth, strict=True)
-        return float(np.mean([region.contains(y) for region, y in pairs]))
+        pairs = zip(sets, self.seen.truth, strict=True)
+        return float(np.mean([each.contains(y) for each, y in pairs]))
 
     def levels(self) -> list[dict[str, Any]]:
         """Return the report's entries for all thresholds."""
@@ -376,11 +376,11 @@ class _Sets:
 
     def level(self, entry: Threshold) -> dict[str, Any]:
         """Return the report's entry for one threshold."""
-        regions = self.seen.regions(self.odometer.head, entry)
-        covered = self.covered(regions)
-        bounded = np.array([np.isfinite((r.lower, r.upper)).all() for r in regions])
+        sets = self.seen.sets(self.odometer.head, entry)
+        covered = self.covered(sets)
+        bounded = np.array([np.isfinite((each.lower, each.upper)).all() for each in sets])
         limits = workspace(self.calibration)
-        limited = [region.within(*limits) for region in regions]
+        limited = [each.within(*limits) for each in sets]
         n, n_test = self.calibration.calibration.n, len(covered)
         used = [level for level in self.odometer.head.side_confidences(0.9) if level is not None]
         one_bound = len(used) < len(self.odometer.head.side_confidences(0.9))
@@ -409,7 +409,7 @@ class _Sets:
             if banded
             else None,
             "coverage_band_exact": self.claim == "exact",
-            "joint_coverage": self.covered_jointly(regions),
+            "joint_coverage": self.covered_jointly(sets),
             **self.widths(limited, alpha),
             "unbounded_share": float(1.0 - bounded.mean()),
             **(
@@ -417,13 +417,15 @@ class _Sets:
                 if entry.scope == "joint"
                 else {"adaptiveness": self.adaptiveness(limited)}
             ),
-            **self.pieces(regions),
+            **self.pieces(sets),
         }
 
-    def widths(self, regions: list[ConformalSet], alpha: float) -> dict[str, Any]:
+    def widths(self, sets: list[ConformalSet], alpha: float) -> dict[str, Any]:
         """Widths and interval score (6,) of bounded sets, and its mean over the deviations."""
-        width = np.array([region.width() for region in regions])
-        distance = np.array([r.distance(y) for r, y in zip(regions, self.seen.truth, strict=True)])
+        width = np.array([each.width() for each in sets])
+        distance = np.array(
+            [each.distance(y) for each, y in zip(sets, self.seen.truth, strict=True)]
+        )
         score = interval_score(width, distance, alpha).mean(axis=0)
         return {
             "mean_width": width.mean(axis=0).tolist(),
@@ -432,7 +434,7 @@ class _Sets:
             "normalised_interval_score": float((score / self.deviation).mean()),
         }
 
-    def adaptiveness(self, regions: list[ConformalSet]) -> dict[str, float | None]:
+    def adaptiveness(self, sets: list[ConformalSet]) -> dict[str, float | None]:
         """How far widths follow the point's errors, mean over the degrees of freedom.
 
         ``width_ratio``: mean width on the third of the frames with the largest errors over that on
@@ -440,14 +442,14 @@ class _Sets:
         degree of freedom has one width for all frames, or none at all, and with too few frames.
         """
         return adaptiveness(
-            np.array([region.width() for region in regions]),
+            np.array([each.width() for each in sets]),
             np.abs(self.seen.truth - self.seen.point),
         )
 
-    def volumes(self, regions: list[ConformalSet]) -> dict[str, Any]:
+    def volumes(self, sets: list[ConformalSet]) -> dict[str, Any]:
         """Return volumes of the joint sets of all frames, bounded, in standardised units."""
         logarithm = np.array(
-            [region_log_volume(r, self.deviation, seed) for seed, r in enumerate(regions)]
+            [set_log_volume(each, self.deviation, seed) for seed, each in enumerate(sets)]
         )
         # No number of JSON is larger.
         volume = np.exp(np.minimum(logarithm, _LARGEST_LOG))
@@ -470,20 +472,20 @@ class _Sets:
         lower, upper = outputs["lower"].astype(np.float64), outputs["upper"].astype(np.float64)
         # The additive score's set at the threshold zero.
         rows = zip(lower, upper, self.seen.point, strict=True)
-        regions = [IntervalScore(None).inverse(*row, np.zeros(6), np.zeros(6)) for row in rows]
-        covered = self.covered(regions)
+        sets = [IntervalScore(None).inverse(*row, np.zeros(6), np.zeros(6)) for row in rows]
+        covered = self.covered(sets)
         return {
             "coverage": covered.mean(axis=0).tolist(),
             "joint_coverage": float(covered.all(axis=1).mean()),
-            **self.widths(regions, 0.1),
+            **self.widths(sets, 0.1),
         }
 
-    def pieces(self, regions: list[ConformalSet]) -> dict[str, Any]:
+    def pieces(self, sets: list[ConformalSet]) -> dict[str, Any]:
         """For sets of classes: how many of them (6,), and how often there is a gap (6,), at all."""
         if not isinstance(self.odometer.head, CspHead):
             return {}
-        gaps = np.array([[len(row) > 1 for row in region.bands or ()] for region in regions])
-        classes = np.array([self.odometer.head.classes_in(region) for region in regions])
+        gaps = np.array([[len(row) > 1 for row in each.bands or ()] for each in sets])
+        classes = np.array([self.odometer.head.classes_in(each) for each in sets])
         return {
             "set_size": classes.mean(axis=0).tolist(),
             "disjoint_share": gaps.mean(axis=0).tolist(),
@@ -497,9 +499,9 @@ class _Sets:
         if marginal is None or joint is None:
             return {}
         head = self.odometer.head
-        covered = self.covered(self.seen.regions(head, marginal))
-        pairs = zip(self.seen.regions(head, joint), self.seen.truth, strict=True)
-        jointly = np.array([region.contains(y) for region, y in pairs])
+        covered = self.covered(self.seen.sets(head, marginal))
+        pairs = zip(self.seen.sets(head, joint), self.seen.truth, strict=True)
+        jointly = np.array([each.contains(y) for each, y in pairs])
         found = {}
         for number in np.unique(self.seen.sequence).tolist():
             rows = np.flatnonzero(np.equal(self.seen.sequence, number))

@@ -169,13 +169,15 @@ def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
             heights.append(top - bottom)
             places.append(row)
         # A region of all six misses as a whole.
-        whole = estimate.region.ellipsoids
-        if not (whole.contains(truth[row]) if whole else estimate.region.covers(truth[row])[dof]):
+        whole = estimate.conformal_set.ellipsoids
+        if not (
+            whole.contains(truth[row]) if whole else estimate.conformal_set.covers(truth[row])[dof]
+        ):
             missed.append(row)
     axes.bar(places, heights, 1.0, bottoms, color=BAND, alpha=0.6, linewidth=0, label="set")
     axes.plot(rows, scale * point, color=POINT, linewidth=0.9, label="point")
     axes.plot(rows, shown, color=TRUTH, linewidth=0.9, label="truth")
-    regions = any(estimates[row].region.ellipsoids for row in rows)
+    regions = any(estimates[row].conformal_set.ellipsoids for row in rows)
     label = "outside of the region of all six" if regions else "missed"
     axes.plot(missed, scale * truth[missed, dof], "x", color=MISSED, markersize=5, label=label)
     axes.set_ylim(shown.min() - 0.4 * spread, shown.max() + 0.4 * spread)

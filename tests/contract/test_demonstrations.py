@@ -37,7 +37,7 @@ def test_eight_bits_cost_little_and_the_file_is_smaller(method, clip_dir):
     frames = list(open_source(str(clip_dir)))
     with Odometer.load(plain) as first, Odometer.load(int8) as second:
         widths = [
-            np.mean([e.region.width() for e in odometer.stream(frames)], axis=0)
+            np.mean([e.conformal_set.width() for e in odometer.stream(frames)], axis=0)
             for odometer in (first, second)
         ]
     assert np.mean(widths[1] / widths[0]) < 1.1

@@ -90,7 +90,7 @@ def test_the_additive_set_is_the_bounds_plus_and_minus_the_threshold(bundle):
 def test_a_set_is_exactly_where_the_score_is_at_most_the_threshold(bundle):
     with odometer(bundle) as made:
         seen = made.observe(IMAGE, 0)
-        region = made.region(seen)
+        region = made.conformal_set(seen)
         for y in np.linspace(-3, 3, 61):
             truth = np.full((1, 6), y)
             score = made.head.scores(seen.outputs, seen.point[None], truth)[0, 0]

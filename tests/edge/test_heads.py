@@ -36,7 +36,7 @@ def test_an_interval_is_exactly_where_the_symmetric_score_is_at_most_q(make_head
     outputs, point = bounds(3)
     if score == "residual":
         outputs = {}
-    region = head.region(outputs, point[0], threshold([q_hat] * 6))
+    region = head.conformal_set(outputs, point[0], threshold([q_hat] * 6))
     limit = np.inf if q_hat is None else q_hat
     for y in GRID:
         scores = head.scores(outputs, point, np.full((1, 6), y))
@@ -51,7 +51,7 @@ def test_two_sides_have_a_threshold_each(make_head, score):
     parameters = {"half_width_floor": FLOOR, "sides": "asymmetric"}
     head = make_head("cqr", score, parameters, q_hat_upper=(None,) * 6)
     outputs, point = bounds(5)
-    region = head.region(outputs, point[0], threshold([0.2] * 6, [0.9] * 6))
+    region = head.conformal_set(outputs, point[0], threshold([0.2] * 6, [0.9] * 6))
     for y in GRID:
         below, above = head.scores(outputs, point, np.full((1, 6), y))[0]
         near = np.isclose(below, 0.2, atol=1e-9) | np.isclose(above, 0.9, atol=1e-9)
@@ -79,7 +79,7 @@ def test_a_lower_bound_alone_leaves_the_upper_side_open(make_head):
     parameters = {"half_width_floor": FLOOR, "sides": "lower"}
     head = make_head("cqr", "additive", parameters, q_hat_upper=(None,) * 6)
     outputs, point = bounds(1)
-    region = head.region(outputs, point[0], threshold([0.1] * 6, [None] * 6))
+    region = head.conformal_set(outputs, point[0], threshold([0.1] * 6, [None] * 6))
     np.testing.assert_allclose(region.lower, outputs["lower"][0] - 0.1)
     assert (region.upper == np.inf).all()
 
@@ -152,7 +152,7 @@ def test_a_set_of_classes_is_where_the_score_is_at_most_q_and_the_likeliest_clas
 ):
     head = make_head("csp", str(score), parameters(0.05, 2))
     outputs = probabilities(seed)
-    region = head.region(outputs, np.zeros(6), threshold([q_hat] * 6))
+    region = head.conformal_set(outputs, np.zeros(6), threshold([q_hat] * 6))
     likeliest = outputs["probabilities"][0].argmax(axis=1)
     for dof, edges in enumerate(EDGES):
         for number in range(len(edges) - 1):
@@ -168,7 +168,7 @@ def test_adjacent_classes_merge_and_others_stay_apart(make_head):
     p[0, 0] = [0.4, 0.0, 0.0, 0.3, 0.3]
     p[0, 1, :2] = [0.5, 0.5]
     p[0, 2:] = [0.2, 0.2, 0.2, 0.2, 0.2]
-    region = head.region({"probabilities": p}, np.zeros(6), threshold([0.75] * 6))
+    region = head.conformal_set({"probabilities": p}, np.zeros(6), threshold([0.75] * 6))
     assert region.bands[0] == ((-2.0, -1.0), (0.5, 2.0))
     assert region.bands[1] == ((-2.0, 2.0),)
     assert region.lower[0] == -2.0
@@ -184,16 +184,16 @@ def test_no_set_is_empty_and_none_leaves_the_workspace(make_head):
     head = make_head("csp", "aps", parameters())
     for seed in range(50):
         outputs = probabilities(seed)
-        smallest = head.region(outputs, np.zeros(6), threshold([0.0] * 6))
+        smallest = head.conformal_set(outputs, np.zeros(6), threshold([0.0] * 6))
         assert (smallest.width() > 0).all()
-        largest = head.region(outputs, np.zeros(6), threshold([2.0] * 6))
+        largest = head.conformal_set(outputs, np.zeros(6), threshold([2.0] * 6))
         assert largest.lower.tolist() == [row[0] for row in EDGES]
         assert largest.upper.tolist() == [row[-1] for row in EDGES]
 
 
 def test_an_unbounded_threshold_is_everything_and_the_others_stay(make_head):
     head = make_head("csp", "aps", parameters())
-    region = head.region(probabilities(0), np.zeros(6), threshold([None, *[0.5] * 5]))
+    region = head.conformal_set(probabilities(0), np.zeros(6), threshold([None, *[0.5] * 5]))
     assert region.bands[0] == ((-np.inf, np.inf),)
     assert region.covers([1e9, 0, 0, 0, 0, 0])[0]
     assert np.isfinite(region.lower[1:]).all()
@@ -247,7 +247,7 @@ def test_an_unused_class_is_never_the_likeliest(make_head):
     head = make_head("csp", "aps", parameters())
     outputs = probabilities(0)
     outputs["probabilities"][0, 1] = [0.1, 0.2, 0.7, 0.0, 0.0]  # a DoF of two classes
-    region = head.region(outputs, np.zeros(6), threshold([0.0] * 6))
+    region = head.conformal_set(outputs, np.zeros(6), threshold([0.0] * 6))
     assert region.bands[1] == ((0.0, 2.0),)
 
 
@@ -295,7 +295,7 @@ def test_what_has_no_extent_holds_nothing(make_head):
     outputs = codebooks(0)
     outputs["scale"][0, 2, 2] = 0.0
     head = make_head("mcqr", "additive", POINTS)
-    region = head.region(outputs, np.zeros(6), threshold([1e9] * 6, scope="joint"))
+    region = head.conformal_set(outputs, np.zeros(6), threshold([1e9] * 6, scope="joint"))
     assert not region.contains(outputs["codebook"][0, 0])
     scores = head.scores(outputs, np.zeros((1, 6)), outputs["codebook"][:, 0], "joint")
     assert np.isinf(scores).all()
@@ -305,7 +305,7 @@ def test_what_has_no_extent_holds_nothing(make_head):
 def test_the_joint_region_is_exactly_where_the_distance_is_at_most_r(make_head, radius):
     head = make_head("mcqr", "normalised", POINTS)
     outputs = codebooks(2)
-    region = head.region(outputs, np.zeros(6), threshold([radius] * 6, scope="joint"))
+    region = head.conformal_set(outputs, np.zeros(6), threshold([radius] * 6, scope="joint"))
     limit = np.inf if radius is None else radius
     inside = 0
     for y in near(outputs, 3):
@@ -322,7 +322,7 @@ def test_the_joint_region_is_exactly_where_the_distance_is_at_most_r(make_head, 
 def test_the_hull_touches_the_region_on_all_twelve_sides(make_head):
     head = make_head("mcqr", "normalised", POINTS)
     outputs = codebooks(4)
-    region = head.region(outputs, np.zeros(6), threshold([1.5] * 6, scope="joint"))
+    region = head.conformal_set(outputs, np.zeros(6), threshold([1.5] * 6, scope="joint"))
     codebook, scale = outputs["codebook"][0].astype(float), outputs["scale"][0].astype(float)
     for dof in range(6):
         # The ellipsoid's own point that lies furthest along this axis.
@@ -344,7 +344,9 @@ def test_the_hull_holds_the_furthest_points_to_the_last_bit(make_head):
                 scale[dof]
             )
             radius = float(scaled_distance(outputs["codebook"][0], scale, furthest))
-            region = head.region(outputs, np.zeros(6), threshold([radius] * 6, scope="joint"))
+            region = head.conformal_set(
+                outputs, np.zeros(6), threshold([radius] * 6, scope="joint")
+            )
             assert region.contains(furthest)
             assert region.covers(furthest).all()
 
@@ -353,7 +355,7 @@ def test_no_radius_is_everything_even_without_extent(make_head):
     outputs = codebooks(0)
     outputs["scale"][0, 2] = 0.0
     head = make_head("mcqr", "normalised", POINTS)
-    region = head.region(outputs, np.zeros(6), threshold([None] * 6, scope="joint"))
+    region = head.conformal_set(outputs, np.zeros(6), threshold([None] * 6, scope="joint"))
     assert region.contains(np.full(6, 1e9))
     assert region.covers(np.full(6, -1e9)).all()
     assert (region.lower == -np.inf).all()
@@ -366,7 +368,7 @@ def test_what_is_above_the_diagonal_counts_nowhere(make_head):
     y = near(plain, 9, 50)
     for scope in ("marginal", "joint"):
         one, other = (
-            head.region(given, np.zeros(6), threshold([1.0] * 6, scope=scope))
+            head.conformal_set(given, np.zeros(6), threshold([1.0] * 6, scope=scope))
             for given in (plain, outputs)
         )
         np.testing.assert_array_equal(one.upper, other.upper)
@@ -383,7 +385,7 @@ def test_six_intervals_on_the_raw_hull_are_where_the_marginal_score_is_at_most_q
 ):
     head = make_head("mcqr", score, POINTS)
     outputs = codebooks(5)
-    region = head.region(outputs, np.zeros(6), threshold([q_hat] * 6))
+    region = head.conformal_set(outputs, np.zeros(6), threshold([q_hat] * 6))
     assert region.ellipsoids is None
     for y in GRID:
         scores = head.scores(outputs, np.zeros((1, 6)), np.full((1, 6), y))[0, 0]

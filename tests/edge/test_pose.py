@@ -31,7 +31,7 @@ def estimate(region, pose=None, chart=None, status=Status.OK):
         status=status,
         reasons=(),
         pose=Pose.from_array(pose if pose is not None else [0, 0, 0, 0, 0, 0, 1]),
-        region=region,
+        conformal_set=region,
         confidence=0.9,
         scope="marginal",
         chart=chart or Chart("tangent_predicted"),

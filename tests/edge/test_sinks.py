@@ -85,7 +85,7 @@ def test_tum_without_stamps_is_refused(tmp_path, bundle_dir, clip_dir):
 
 
 def test_table_says_unbounded_in_words(tmp_path, estimates):
-    wide = [dataclasses.replace(estimates[0], region=unbounded_set())]
+    wide = [dataclasses.replace(estimates[0], conformal_set=unbounded_set())]
     assert write(tmp_path / "a.txt", "table", wide).count("unbounded") == 6
 
 

@@ -345,7 +345,7 @@ def test_own_figures_are_those_of_cqr_at_the_threshold_zero(runs, name):
     zero = Threshold(confidence=0.9, scope="marginal", q_hat=(0.0,) * 6, q_hat_upper=None)
     with Odometer(content) as odometer:
         seen = observe(odometer, run.dataset, run.split.roles["test"])
-    regions = seen.regions(head, zero)
+    regions = seen.sets(head, zero)
     covered = np.array([r.covers(y) for r, y in zip(regions, seen.truth, strict=True)])
     distance = np.array([r.distance(y) for r, y in zip(regions, seen.truth, strict=True)])
     width = np.array([region.width() for region in regions])

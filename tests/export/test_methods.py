@@ -121,7 +121,7 @@ def test_evaluation_is_that_of_the_odometer_frame_by_frame(runs, method):
         for index in run.split.roles["test"].tolist():
             estimate = odometer.step(run.dataset.read_image(index))
             covered.append(estimate.covers(run.dataset.poses[index]))
-            widths.append(estimate.region.width())
+            widths.append(estimate.conformal_set.width())
     np.testing.assert_allclose(level["coverage"], np.mean(covered, axis=0))
     np.testing.assert_allclose(level["mean_width"], np.mean(widths, axis=0))
     low, high = level["coverage_band"]
@@ -346,15 +346,15 @@ def test_contains_is_the_region_in_the_joint_scope_and_six_intervals_in_the_marg
                 held = estimate.contains(truth)
                 inside.setdefault(scope, []).append(held)
                 if scope == "marginal":
-                    assert estimate.region.ellipsoids is None
+                    assert estimate.conformal_set.ellipsoids is None
                     assert held == estimate.covers(truth).all()
                 else:
                     coordinates = estimate.chart.coordinates(truth, estimate.pose.to_array())
-                    assert held == estimate.region.ellipsoids.contains(coordinates)
+                    assert held == estimate.conformal_set.ellipsoids.contains(coordinates)
                     # The hull is larger than its region.
                     corner = 0.999 * estimate.upper + 0.001 * estimate.lower
-                    assert estimate.region.covers(corner).all()
-                    assert not estimate.region.contains(corner)
+                    assert estimate.conformal_set.covers(corner).all()
+                    assert not estimate.conformal_set.contains(corner)
     report = evaluate(bundle, run.dataset, "test")
     for scope, held in inside.items():
         level = find_level(report["levels"], 0.8, scope)
@@ -368,7 +368,7 @@ def test_the_volume_is_the_share_of_the_hull_that_lies_in_the_region(runs):
     with Odometer.load(bundle, scope="joint") as odometer:
         deviation = np.array(odometer.calibration.pose.standard_deviation)
         for index in run.split.roles["test"].tolist():
-            region = odometer.step(run.dataset.read_image(index)).region
+            region = odometer.step(run.dataset.read_image(index)).conformal_set
             points = generator.uniform(region.lower, region.upper, (400, 6))
             held = np.mean([region.ellipsoids.contains(point) for point in points])
             shares.append(held * np.prod((region.upper - region.lower) / deviation))
@@ -492,8 +492,8 @@ def test_bands_reach_the_record_the_csv_and_contains(runs, tmp_path):
     middle = [0.5 * (row[0][0] + row[0][1]) for row in gapped.bands]
     in_gap = list(middle)
     in_gap[dof] = 0.5 * (gapped.bands[dof][0][1] + gapped.bands[dof][1][0])
-    assert gapped.region.covers(middle).all()
-    assert not gapped.region.covers(in_gap)[dof]
+    assert gapped.conformal_set.covers(middle).all()
+    assert not gapped.conformal_set.covers(in_gap)[dof]
 
 
 def test_boxes_are_the_product_of_the_position_bands(runs):
@@ -503,7 +503,7 @@ def test_boxes_are_the_product_of_the_position_bands(runs):
     boxes = estimate.position_boxes()
     assert len(boxes) == np.prod([len(row) for row in estimate.bands[:3]])
     volume = np.prod(boxes[:, :, 1] - boxes[:, :, 0], axis=1).sum()
-    assert volume == pytest.approx(np.prod(estimate.region.width()[:3]))
+    assert volume == pytest.approx(np.prod(estimate.conformal_set.width()[:3]))
 
 
 def test_the_report_counts_classes_and_pieces(runs):
@@ -579,7 +579,7 @@ def test_what_val_judges_is_what_the_runtime_gives(runs):
     scores = head.scores(seen.outputs, seen.point, seen.truth)
     q_hat = [conformal_quantile(scores[:, 0, dof], 0.9) for dof in range(6)]
     entry = Threshold(confidence=0.9, scope="marginal", q_hat=tuple(q_hat), q_hat_upper=None)
-    regions = seen.regions(head, entry)
+    regions = seen.sets(head, entry)
     width = np.array([region.width() for region in regions])
     distance = np.array([r.distance(y) for r, y in zip(regions, seen.truth, strict=True)])
     expected = interval_score(width, distance, 0.1) / target.std

@@ -63,7 +63,7 @@ def test_thresholds_are_those_of_the_providers_own_numbers(eight, of_openvino, t
             assert isinstance(odometer.session, OpenvinoSession)
             inside = np.array(
                 [
-                    odometer.region(seen).covers(point)
+                    odometer.conformal_set(seen).covers(point)
                     for seen, point in observations(odometer, tiny_run.dataset, roles["cal"])
                 ]
             )

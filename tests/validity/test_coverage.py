@@ -152,7 +152,7 @@ def coverages(head, n, joint="max"):
         by_scope = {e.scope: e for e in entries if e.confidence == CONFIDENCE}
         for row in range(start + n, start + n + JUDGED):
             one = {name: values[row : row + 1] for name, values in outputs.items()}
-            inner, outer = (head.region(one, point[row], by_scope[s]) for s in by_scope)
+            inner, outer = (head.conformal_set(one, point[row], by_scope[s]) for s in by_scope)
             y = truth[row]
             marginal.append(inner.covers(y).mean())
             hulls.append(((inner.lower <= y) & (y <= inner.upper)).mean())

@@ -83,10 +83,10 @@ class Observed:
         )
         return Scored(marginal, joint, self.sequence)
 
-    def regions(self, head: Head, entry: Threshold) -> list[ConformalSet]:
+    def sets(self, head: Head, entry: Threshold) -> list[ConformalSet]:
         """Return the set of every frame at a threshold."""
         return [
-            head.region(
+            head.conformal_set(
                 {name: values[row : row + 1] for name, values in self.outputs.items()},
                 point,
                 entry,
@@ -256,9 +256,9 @@ def chosen(draft: Calibration, val: Observed, candidates: Sequence[Candidate]) -
         scores = head.scores(val.outputs, val.point, val.truth)
         entry = _threshold(0.9, "marginal", marginal_thresholds(head, scores, 0.9, _pooled))
         limits = workspace(calibration)
-        regions = [region.within(*limits) for region in val.regions(head, entry)]
-        width = np.array([region.width() for region in regions])
-        distance = np.array([r.distance(y) for r, y in zip(regions, val.truth, strict=True)])
+        sets = [each.within(*limits) for each in val.sets(head, entry)]
+        width = np.array([each.width() for each in sets])
+        distance = np.array([each.distance(y) for each, y in zip(sets, val.truth, strict=True)])
         deviation = np.array(calibration.pose.standard_deviation)
         results.append(float((interval_score(width, distance, 0.1) / deviation).mean()))
     best = int(np.argmin(results))

@@ -67,7 +67,7 @@ def _draw_about_truth(axes: Axes, track: Track, reach: float) -> None:
             places.append(row)
             bottoms.append(low)
             heights.append(high - low)
-        if not estimate.region.covers(track.truth[row])[0]:
+        if not estimate.conformal_set.covers(track.truth[row])[0]:
             missed.append(row)
     axes.bar(places, heights, 1.0, bottoms, color=BAND, alpha=0.8, linewidth=0)
     axes.axhline(0.0, color=TRUTH, linewidth=0.9)
