@@ -21,7 +21,7 @@ from time import perf_counter
 import numpy as np
 from networks import pose_alone
 
-from cvo_edge.bundle.reading import read_bundle
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.engine.session import Session
 from cvo_edge.input import preprocess
 from cvo_edge.input.sources import open_source

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.reading import read_bundle
 from cvo_edge.conformal import conformal_quantile, conformal_rank
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.odometer import Odometer
 from cvo_export.bundles.thresholds import observe
 from cvo_export.data.splits import same_split

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cvo_edge.conformal import conformal_quantile
+from cvo_export.bundles.figures import coverage_band
 from cvo_export.bundles.volume import union_log_volume
-from cvo_export.evaluate import coverage_band
 from cvo_export.networks.directional import (
     Choice,
     RegionConfig,

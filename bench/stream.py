@@ -28,7 +28,7 @@ import onnxruntime
 from networks import BACKBONES, WORK, frames, images, whole_bundle
 from rounds import figures, in_turn, interleaved, ratio, write_report
 
-from cvo_edge.bundle.reading import read_bundle
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
