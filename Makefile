@@ -69,7 +69,6 @@ bench: $(VENV)/.installed
 	$(VENV)/bin/python bench/scaling.py
 	$(VENV)/bin/python bench/peers.py
 	$(VENV)/bin/python bench/uncertainty_peers.py
-	$(VENV)/bin/python bench/speed_tables.py
 	$(VENV)/bin/python bench/goals.py
 
 soak: $(VENV)/.installed
