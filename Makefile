@@ -62,7 +62,6 @@ bench: $(VENV)/.installed ## measure speed, memory and start-up against other en
 	$(VENV)/bin/python bench/scaling.py
 	$(VENV)/bin/python bench/peers.py
 	$(VENV)/bin/python bench/uncertainty_peers.py
-	$(VENV)/bin/python bench/speed_tables.py
 	$(VENV)/bin/python bench/goals.py
 
 soak: $(VENV)/.installed ## process a million frames and watch memory; half an hour
