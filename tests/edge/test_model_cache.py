@@ -228,7 +228,9 @@ def test_a_folder_that_others_may_write_to_is_not_used(bundle_dir, cache):
 def test_a_cache_that_cannot_be_made_costs_nothing_but_itself(bundle_dir, tmp_path):
     (tmp_path / "file").write_text("no folder")
     assert isinstance(read_bundle(bundle_dir, cache=ModelCache(tmp_path / "file")).model, bytes)
-    assert isinstance(read_bundle(bundle_dir, cache=ModelCache(tmp_path / "file" / "below")).model, bytes)
+    assert isinstance(
+        read_bundle(bundle_dir, cache=ModelCache(tmp_path / "file" / "below")).model, bytes
+    )
 
 
 def test_a_full_disk_costs_the_entry_alone(bundle_dir, clip_dir, tmp_path):
