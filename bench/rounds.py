@@ -94,7 +94,7 @@ def write_report(name: str, results: Mapping[str, Any], **settings: object) -> N
         "command": " ".join(["python", f"bench/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
         "settings": settings,
         "date": datetime.now(UTC).date().isoformat(),
-        "commit": _commit(),
+        "commit": commit(),
         "environment": environment(),
         "results": results,
     }
@@ -104,7 +104,7 @@ def write_report(name: str, results: Mapping[str, Any], **settings: object) -> N
     print(f"-> {target}")
 
 
-def _commit() -> str:
+def commit() -> str:
     """Return which commit of the repository this is, with a plus where files differ from it."""
     command = ["git", "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
     try:
