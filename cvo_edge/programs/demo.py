@@ -67,7 +67,7 @@ def demo(bundle: Path, picture: Path) -> None:
     drawn = draw_run(
         estimates,
         [truth.pose_of(estimate) for estimate in estimates],
-        f"{name}: intervals that hold the truth with probability {_CONFIDENCE:g}",
+        f"{name}: each interval holds the truth with probability {_CONFIDENCE:g}",
         [_found(summary), f"Expected: {expected}" if expected else ""],
     )
     write_png(picture, drawn)
@@ -90,8 +90,8 @@ def expected_coverage(digest: str) -> str | None:
     )
     return (
         f"{each} per DoF (mean {found['one_dof']['mean']:.2f}), {six} for all six (mean "
-        f"{found['all_six']['mean']:.2f}) in 9 of 10 new flights; errors of neighbouring frames "
-        f"are correlated ({report['flights']} flights measured)"
+        f"{found['all_six']['mean']:.2f}) in 9 of 10 new flights ({report['flights']} measured); "
+        "errors of neighbouring frames are correlated"
     )
 
 
