@@ -8,16 +8,18 @@ RELEASE_VENV := .venv-release
 LOWEST_VENV := .venv-lowest
 METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
-CLIP := calibration_artifacts/synthetic-room-clip
+RUNTIME := $(shell find cvo_edge -type f -not -name "*.pyc")
 
 .PHONY: help demo test check bench soak fuzz arm64 avx2 format clean
 
 help: ## list all targets
 	@awk -F ':.*## ' '/^[a-z0-9 -]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-$(DEMO_VENV)/.installed: pyproject.toml
+# Installed as users do, not editable: the demonstration proves that the wheel holds its data.
+$(DEMO_VENV)/.installed: pyproject.toml $(RUNTIME)
 	$(PYTHON) -m venv $(DEMO_VENV)
-	$(DEMO_VENV)/bin/python -m pip install --quiet --editable .
+	rm -rf build/lib build/bdist.*
+	$(DEMO_VENV)/bin/python -m pip install --quiet .
 	@touch $@
 
 $(VENV)/.installed: pyproject.toml export/pyproject.toml
@@ -26,15 +28,13 @@ $(VENV)/.installed: pyproject.toml export/pyproject.toml
 	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable "./export[plot,ray]"
 	@touch $@
 
-demo: $(addprefix demo-,$(METHODS)) ## install the runtime without torch and run the demonstration of every method
-	@echo "every frame's record: $(addprefix demo-,$(METHODS:=.jsonl))"
-	@echo "each bundle alone: make $(addprefix demo-,$(METHODS))"
+demo: $(DEMO_VENV)/.installed $(addprefix demo-,$(METHODS)) ## install the runtime without torch and run the demonstration of every method
+	@echo "== the packaged bundle"
+	$(DEMO_VENV)/bin/cvo-edge demo
 
 demo-%: $(DEMO_VENV)/.installed
 	@echo "== synthetic-room-$*"
-	$(DEMO_VENV)/bin/cvo-edge verify $(BUNDLE)-$*
-	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE)-$* $(CLIP) --format table --max-frames 4 --quiet
-	$(DEMO_VENV)/bin/cvo-edge run $(BUNDLE)-$* $(CLIP) --ground-truth $(CLIP) --output demo-$*.jsonl
+	$(DEMO_VENV)/bin/cvo-edge demo $(BUNDLE)-$* --picture demo-$*.png
 
 # A second release of OpenCV, for the tests that compare how both decode the same files.
 .opencv4: $(VENV)/.installed
@@ -78,7 +78,7 @@ format: $(VENV)/.installed ## reformat the code
 clean: ## delete everything that these targets create
 	rm -rf $(VENV) $(DEMO_VENV) $(RELEASE_VENV) $(LOWEST_VENV) .opencv4 .boards build dist export/build
 	rm -rf *.egg-info export/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
-	rm -f $(addprefix demo-,$(METHODS:=.jsonl))
+	rm -f $(addprefix demo-,$(METHODS:=.png)) cvo-edge-demo.png
 
 # --- Packages -------------------------------------------------------------------------------------
 

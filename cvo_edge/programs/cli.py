@@ -81,6 +81,26 @@ PublicKeyOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
+@app.command("demo")
+def demonstrate(
+    bundle: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A bundle for the synthetic room; the packaged one by default.",
+            readable=False,
+            show_default=False,
+        ),
+    ] = None,
+    picture: Annotated[Path, typer.Option(help="PNG file to write.", readable=False)] = Path(
+        "cvo-edge-demo.png"
+    ),
+) -> None:
+    """Run a bundle on the packaged clip, compare it with the ground truth and draw a picture."""
+    from cvo_edge.programs.demo import BUNDLE, demo
+
+    demo(bundle or BUNDLE, picture)
+
+
 @app.command()
 def run(
     bundle: BundleArgument,
@@ -241,10 +261,7 @@ def verify(
     from cvo_edge.programs.verify import verify_bundle
 
     verdict = verify_bundle(bundle, threads=threads, timeout_s=timeout, public_key=public_key)
-    print(
-        f"{verdict.name}: digests match, model loads, self-test passed "
-        f"(largest difference {verdict.largest_difference:.2g}, tolerance {verdict.tolerance:g})"
-    )
+    print(verdict.line())
 
 
 @app.command()

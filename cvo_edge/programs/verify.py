@@ -50,6 +50,13 @@ class Verdict:
     largest_difference: float
     tolerance: float
 
+    def line(self) -> str:
+        """Return the verdict as a line of text for a person."""
+        return (
+            f"{self.name}: digests match, model loads, self-test passed (largest difference "
+            f"{self.largest_difference:.2g}, tolerance {self.tolerance:g})"
+        )
+
 
 def verify_bundle(
     folder: Path,

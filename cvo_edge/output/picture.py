@@ -1,0 +1,382 @@
+"""One picture of a run with ground truth, drawn with OpenCV alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cvo_edge.errors import SinkError, UsageError
+from cvo_edge.estimate import PoseInterval
+
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+WIDTH, HEIGHT = 1200, 800
+
+# Palette of Okabe and Ito (2008), which colour-blind readers can tell apart; BGR.
+_TRUTH: Colour = (0, 0, 0)
+_ESTIMATE: Colour = (178, 114, 0)
+_INTERVAL: Colour = (248, 222, 188)  # their sky blue, lighter: lines are drawn on top of it
+_OUTLINE: Colour = (233, 180, 86)
+_MISSED: Colour = (0, 94, 213)
+_MISSED_INTERVAL: Colour = (150, 205, 248)
+_NOTHING: Colour = (225, 225, 225)
+_GRID: Colour = (232, 232, 232)
+_FRAME: Colour = (150, 150, 150)
+_TEXT: Colour = (60, 60, 60)
+
+# Everything is drawn twice as large and then halved, to a sixteenth of a pixel.
+_SCALE, _BITS = 2, 4
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_SAMPLE = "truth inside in 50 of 50 frames"
+_UNITS = (100.0,) * 3 + (math.degrees(1.0),) * 3
+_OUTLINED = 5
+_PADDING = 0.08
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """A frame that has a pose, finite bounds and a true pose; ``number`` is its place in the run.
+
+    ``truth`` and ``point`` (6,) in the estimate's chart, metres and radians.
+    """
+
+    number: int
+    estimate: PoseInterval
+    truth: Array
+    point: Array
+
+    @cached_property
+    def covered(self) -> NDArray[np.bool_]:
+        """Whether the set holds the truth, per DoF (6,)."""
+        return self.estimate.conformal_set.covers(self.truth)
+
+    def bands(self, dof: int) -> Sequence[tuple[float, float]]:
+        """Disjoint intervals of one DoF, ascending."""
+        if self.estimate.bands:
+            return self.estimate.bands[dof]
+        return ((float(self.estimate.lower[dof]), float(self.estimate.upper[dof])),)
+
+
+def draw_run(
+    estimates: Sequence[PoseInterval],
+    truths: Sequence[ArrayLike | None],
+    title: str,
+    lines: Sequence[str] = (),
+) -> NDArray[np.uint8]:
+    """Draw a run beside its ground truth.
+
+    Left: the path in the x-y plane of the world, which is the view from above where z points up,
+    with the boxes of the tx and ty intervals. Right: every DoF over the frames *minus the truth*,
+    cm and deg, so that the zero line is the truth whatever the method's chart. Frames without a
+    pose, finite bounds or a true pose are grey columns.
+
+    Parameters
+    ----------
+    estimates
+        Estimates in the order of the stream.
+    truths
+        True ``T_world_camera`` (7,) of each estimate, or None where it is not known.
+    title, lines
+        A heading and up to two lines below it; printable ASCII, as OpenCV 4 draws nothing else.
+
+    Returns
+    -------
+    NDArray
+        Shape (``HEIGHT``, ``WIDTH``, 3), uint8, BGR.
+
+    Raises
+    ------
+    UsageError
+        No frame has all that is needed, or the lists differ in length.
+    """
+    if len(estimates) != len(truths):
+        raise UsageError(
+            f"picture: expected one true pose per estimate, found {len(truths)} for "
+            f"{len(estimates)} estimates"
+        )
+    frames = _compared(estimates, truths)
+    if not frames:
+        raise UsageError(
+            "picture: expected a frame with finite bounds and a true pose, found none in "
+            f"{len(estimates)}"
+        )
+    canvas = np.full((_SCALE * HEIGHT, _SCALE * WIDTH, 3), 255, np.uint8)
+    _text(canvas, title, (24, 34), 10.5, bold=True, colour=_TRUTH)
+    for number, line in enumerate(lines):
+        _text(canvas, line, (24, 58 + 20 * number), 6.5)
+    _path_from_above(canvas, frames)
+    names = estimates[0].chart.dof
+    for column, heading in enumerate(("Position minus truth (cm)", "Rotation minus truth (deg)")):
+        left = 575 + 320 * column
+        _text(canvas, heading, (left, 102), 7.5, bold=True)
+        for row in range(3):
+            top = 128 + 211 * row
+            panel = (left, top, left + 285, top + 165)
+            _error_over_frames(canvas, panel, frames, 3 * column + row, names, len(estimates))
+        _text(canvas, "frame", (left + 142, 748), 6, align=0.5)
+    _legend(canvas, greyed=len(frames) < len(estimates))
+    picture = cv2.resize(canvas, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    # 32 levels a channel look the same and compress to two thirds.
+    return np.asarray(picture // 8 * 8 + picture // 32, np.uint8)
+
+
+def write_png(path: str | Path, picture: NDArray[np.uint8]) -> None:
+    """Write a picture as PNG; raises SinkError where the file cannot be written."""
+    encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
+    try:
+        Path(path).write_bytes(encoded.tobytes())
+    # A ValueError is a name that no file can have.
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", error)
+        raise SinkError(f"{path}: cannot be written: {reason}") from None
+
+
+def _compared(
+    estimates: Sequence[PoseInterval], truths: Sequence[ArrayLike | None]
+) -> list[_Compared]:
+    found = []
+    for number, (estimate, truth) in enumerate(zip(estimates, truths, strict=True)):
+        if truth is not None and estimate.pose is not None and estimate.bounded:
+            pose = estimate.pose.to_array()
+            seen = estimate.chart.coordinates(truth, pose)
+            found.append(_Compared(number, estimate, seen, estimate.chart.point(pose)))
+    return found
+
+
+# -------------------------------------------------------------------------------------- panels
+
+
+@dataclass(frozen=True, eq=False)
+class _Panel:
+    """A rectangle of the picture (left, top, right, bottom, pixels) with a scale on either axis."""
+
+    canvas: NDArray[np.uint8]
+    area: tuple[int, int, int, int]
+    x: tuple[float, float]
+    y: tuple[float, float]
+
+    def at(self, points: ArrayLike) -> NDArray[np.int32]:
+        """Values (n, 2) -> fixed-point pixels (n, 2) of the enlarged canvas."""
+        left, top, right, bottom = self.area
+        values = np.asarray(points, np.float64)
+        x = left + (values[:, 0] - self.x[0]) / (self.x[1] - self.x[0]) * (right - left)
+        y = bottom - (values[:, 1] - self.y[0]) / (self.y[1] - self.y[0]) * (bottom - top)
+        return _fixed(np.stack([x, y], axis=1))
+
+    def box(self, x: tuple[float, float], y: tuple[float, float]) -> NDArray[np.int32]:
+        """Return the corners of a rectangle of values, cut at the panel's edge."""
+        x = float(np.clip(x[0], *self.x)), float(np.clip(x[1], *self.x))
+        y = float(np.clip(y[0], *self.y)), float(np.clip(y[1], *self.y))
+        return self.at([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
+
+    def grid(self, x_ticks: Array, y_ticks: Array) -> None:
+        """Draw grid lines with their numbers, and the frame."""
+        left, top, right, bottom = self.area
+        for ticks, across in ((x_ticks, False), (y_ticks, True)):
+            step = float(ticks[1] - ticks[0]) if len(ticks) > 1 else 1.0
+            for value in ticks.tolist():
+                ends = [(self.x[0], value), (self.x[1], value)]
+                if not across:
+                    ends = [(value, self.y[0]), (value, self.y[1])]
+                _line(self.canvas, self.at(ends), _GRID, 1.0)
+                x, y = (self.at(ends)[0] / (_SCALE << _BITS)).tolist()
+                label = f"{value + 0.0:.{max(0, -math.floor(math.log10(step) + 1e-9))}f}"
+                if across:
+                    _text(self.canvas, label, (x - 6, y + 4), 5.5, align=1.0)
+                else:
+                    _text(self.canvas, label, (x, bottom + 16), 5.5, align=0.5)
+        corners = [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
+        _line(self.canvas, _fixed(corners), _FRAME, 1.0)
+
+
+def _path_from_above(canvas: NDArray[np.uint8], frames: Sequence[_Compared]) -> None:
+    """Draw truth, estimates and boxes of tx and ty; both axes have one scale."""
+    boxes = [np.unique(frame.estimate.position_boxes()[:, :2], axis=0) for frame in frames]
+    truth = np.array([frame.truth[:2] for frame in frames])
+    points = np.array([frame.point[:2] for frame in frames])
+    shown = np.concatenate(
+        [truth, points, *(each.transpose(0, 2, 1).reshape(-1, 2) for each in boxes)]
+    )
+    area = (75, 128, 505, 715)
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    size = np.array([area[2] - area[0], area[3] - area[1]])
+    # A camera that stands still, and is known exactly, is a point.
+    metres_per_pixel = (1 + 2 * _PADDING) * float(np.max((high - low) / size)) or 1e-6
+    half = 0.5 * metres_per_pixel * size
+    start, end = 0.5 * (low + high) - half, 0.5 * (low + high) + half
+    panel = _Panel(canvas, area, (start[0], end[0]), (start[1], end[1]))
+    for each in boxes:
+        for x, y in each:
+            cv2.fillPoly(canvas, [panel.box(tuple(x), tuple(y))], _INTERVAL, cv2.LINE_8, _BITS)
+    step = _tick_step(float(np.max(end - start)), 8)
+    panel.grid(_ticks(panel.x, step), _ticks(panel.y, step))
+    every = max(1, len(boxes) // _OUTLINED)
+    for each in boxes[::every]:
+        for x, y in each:
+            corners = panel.box(tuple(x), tuple(y))
+            _line(canvas, np.concatenate([corners, corners[:1]]), _OUTLINE, 1.0)
+    for frame in frames:
+        colour = _OUTLINE if frame.covered[:2].all() else _MISSED
+        _line(canvas, panel.at([frame.truth[:2], frame.point[:2]]), colour, 1.0)
+    _line(canvas, panel.at(truth), _TRUTH, 2.0)
+    for place in panel.at(points):
+        _dot(canvas, place, _ESTIMATE)
+    missed = [frame.truth[:2] for frame in frames if not frame.covered[:2].all()]
+    for place in panel.at(np.reshape(missed, (-1, 2))):
+        _cross(canvas, place, _MISSED)
+    _ring(canvas, panel.at(truth[:1])[0], _TRUTH)
+    _text(canvas, "Path in the x-y plane of the world", (area[0], 102), 7.5, bold=True)
+    note = f"outlined: one box in {every}"
+    _text(canvas, note, (area[2], 120), 5.5, align=1.0)
+    _text(canvas, "x (m)", (0.5 * (area[0] + area[2]), 748), 6, align=0.5)
+    _text(canvas, "y (m)", (area[0], 120), 6, align=1.0)
+
+
+def _error_over_frames(
+    canvas: NDArray[np.uint8],
+    area: tuple[int, int, int, int],
+    frames: Sequence[_Compared],
+    dof: int,
+    names: Sequence[str],
+    count: int,
+) -> None:
+    """Draw the intervals and estimates of one DoF minus the truth; zero is the truth."""
+    unit = _UNITS[dof]
+    bands = [
+        [
+            (unit * (low - frame.truth[dof]), unit * (high - frame.truth[dof]))
+            for low, high in frame.bands(dof)
+        ]
+        for frame in frames
+    ]
+    error = [unit * (frame.point[dof] - frame.truth[dof]) for frame in frames]
+    low = min(0.0, *error, *(row[0][0] for row in bands))
+    high = max(0.0, *error, *(row[-1][1] for row in bands))
+    margin = _PADDING * (high - low) or 1.0
+    panel = _Panel(canvas, area, (-0.5, count - 0.5), (low - margin, high + margin))
+    drawn = {frame.number for frame in frames}
+    for number in set(range(count)) - drawn:
+        column = panel.box((number - 0.5, number + 0.5), panel.y)
+        cv2.fillPoly(canvas, [column], _NOTHING, cv2.LINE_AA, _BITS)
+    for frame, row in zip(frames, bands, strict=True):
+        colour = _INTERVAL if frame.covered[dof] else _MISSED_INTERVAL
+        for band in row:
+            corners = panel.box((frame.number - 0.5, frame.number + 0.5), band)
+            # Without anti-aliasing: neighbours would show a seam.
+            cv2.fillPoly(canvas, [corners], colour, cv2.LINE_8, _BITS)
+    panel.grid(
+        _ticks(panel.x, _tick_step(count, 6)),
+        _ticks(panel.y, _tick_step(panel.y[1] - panel.y[0], 5)),
+    )
+    _line(canvas, panel.at([(panel.x[0], 0.0), (panel.x[1], 0.0)]), _TRUTH, 2.0)
+    for place in panel.at([(f.number, y) for f, y in zip(frames, error, strict=True)]):
+        _dot(canvas, place, _ESTIMATE)
+    missed = [(frame.number, 0.0) for frame in frames if not frame.covered[dof]]
+    for place in panel.at(np.reshape(missed, (-1, 2))):
+        _cross(canvas, place, _MISSED)
+    covered = len(frames) - len(missed)
+    _text(canvas, names[dof], (area[0], area[1] - 6), 7, bold=True)
+    note = f"truth inside in {covered} of {len(frames)} frames"
+    _text(canvas, note, (area[2], area[1] - 6), 5.5, align=1.0)
+
+
+def _legend(canvas: NDArray[np.uint8], *, greyed: bool) -> None:
+    y = 774
+    _line(canvas, _fixed([(75, y), (105, y)]), _TRUTH, 2.0)
+    _ring(canvas, _fixed([(75, y)])[0], _TRUTH)
+    _text(canvas, "truth (ring: start)", (113, y + 4), 6)
+    _dot(canvas, _fixed([(255, y)])[0], _ESTIMATE)
+    _text(canvas, "estimate", (266, y + 4), 6)
+    _swatch(canvas, 345, y, _INTERVAL)
+    _text(canvas, "interval that holds the truth", (383, y + 4), 6)
+    _swatch(canvas, 595, y, _MISSED_INTERVAL)
+    _cross(canvas, _fixed([(610, y)])[0], _MISSED)
+    _text(canvas, "truth outside the interval", (633, y + 4), 6)
+    if greyed:
+        _swatch(canvas, 830, y, _NOTHING)
+        _text(canvas, "no interval or no truth", (868, y + 4), 6)
+
+
+# ------------------------------------------------------------------------------------ primitives
+
+
+def _tick_step(extent: float, most: int) -> float:
+    """Return the smallest of 1, 2, 5 times a power of ten that gives at most so many steps."""
+    power: float = 10.0 ** math.floor(math.log10(extent / most))
+    return next(
+        power * factor for factor in (1.0, 2.0, 5.0, 10.0) if extent <= most * power * factor
+    )
+
+
+def _ticks(bounds: tuple[float, float], step: float) -> Array:
+    first, last = math.ceil(bounds[0] / step), math.floor(bounds[1] / step)
+    return step * np.arange(first, last + 1, dtype=np.float64)
+
+
+def _fixed(points: ArrayLike) -> NDArray[np.int32]:
+    """Pixels of the picture (n, 2) -> fixed-point pixels of the enlarged canvas."""
+    return np.asarray(np.round(np.asarray(points, np.float64) * (_SCALE << _BITS)), np.int32)
+
+
+def _line(
+    canvas: NDArray[np.uint8], points: NDArray[np.int32], colour: Colour, width: float
+) -> None:
+    cv2.polylines(canvas, [points], False, colour, round(width * _SCALE), cv2.LINE_AA, _BITS)
+
+
+def _dot(canvas: NDArray[np.uint8], place: NDArray[np.int32], colour: Colour) -> None:
+    cv2.circle(
+        canvas, place.tolist(), round(2.5 * _SCALE * (1 << _BITS)), colour, -1, cv2.LINE_AA, _BITS
+    )
+
+
+def _ring(canvas: NDArray[np.uint8], place: NDArray[np.int32], colour: Colour) -> None:
+    reach = 6 * _SCALE << _BITS
+    cv2.circle(canvas, place.tolist(), reach, colour, round(1.5 * _SCALE), cv2.LINE_AA, _BITS)
+
+
+def _cross(canvas: NDArray[np.uint8], place: NDArray[np.int32], colour: Colour) -> None:
+    reach = 4 * _SCALE << _BITS
+    for diagonal in ((reach, reach), (reach, -reach)):
+        _line(canvas, np.stack([place - diagonal, place + diagonal]).astype(np.int32), colour, 2.0)
+
+
+def _swatch(canvas: NDArray[np.uint8], x: float, y: float, colour: Colour) -> None:
+    corners = _fixed([(x, y - 7), (x + 30, y - 7), (x + 30, y + 7), (x, y + 7)])
+    cv2.fillPoly(canvas, [corners], colour, cv2.LINE_AA, _BITS)
+
+
+def _text(
+    canvas: NDArray[np.uint8],
+    text: str,
+    place: tuple[float, float],
+    size: float,
+    *,
+    align: float = 0.0,
+    bold: bool = False,
+    colour: Colour = _TEXT,
+) -> None:
+    """Write on a baseline; ``align`` is 0 at the left end, 0.5 in the middle, 1 at the right end.
+
+    ``size`` is the mean width of a character in pixels: OpenCV 4 and 5 have different fonts, whose
+    widths have to fit the same layout.
+    """
+    thickness = 4 if bold else 2
+    scale = size * _SCALE / _character_width(thickness)
+    width = cv2.getTextSize(text, _FONT, scale, thickness)[0][0]
+    origin = (round(place[0] * _SCALE - align * width), round(place[1] * _SCALE))
+    cv2.putText(canvas, text, origin, _FONT, scale, colour, thickness, cv2.LINE_AA)
+
+
+@cache
+def _character_width(thickness: int) -> float:
+    """Mean width of a character at scale 1, pixels."""
+    return float(cv2.getTextSize(_SAMPLE, _FONT, 1.0, thickness)[0][0]) / len(_SAMPLE)
