@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from threading import Condition, Event, Thread
 from time import perf_counter
 from typing import TypeVar
@@ -23,19 +22,12 @@ from cvo_edge.errors import UsageError
 from cvo_edge.input.capture import READER
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.queue_lag import clock_s
+from cvo_edge.vocabulary import Mode as Mode
 
 Result = TypeVar("Result")
 
 # Queued behind those at work, so that a slow one does not keep the others waiting.
 AHEAD = 2
-
-
-class Mode(StrEnum):
-    """What a stream is to be good at, see above."""
-
-    LIVE = "live"
-    LATENCY = "latency"
-    THROUGHPUT = "throughput"
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cvo_edge.vocabulary import Scope as Scope
+
 Array = NDArray[np.float64]
 
-Scope = Literal["marginal", "joint"]
 Bands = tuple[tuple[tuple[float, float], ...], ...]
 
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from msgspec import Struct
@@ -32,9 +32,9 @@ from cvo_edge.bundle.format import Calibration, SixOrUnbounded, SixPositive, Thr
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.sets import ConformalSet, Scope
+from cvo_edge.vocabulary import Sides as Sides
 
 Array = NDArray[np.float64]
-Sides = Literal["symmetric", "asymmetric", "lower", "upper"]
 
 _POINT: dict[str, tuple[int, ...]] = {"pose": (1, 7)}
 _BOUNDED: dict[str, tuple[int, ...]] = {**_POINT, "lower": (1, 6), "upper": (1, 6)}

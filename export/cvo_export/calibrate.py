@@ -8,7 +8,6 @@ gets thresholds of other data: a new site, another camera, another light.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import onnx
@@ -50,9 +49,9 @@ from cvo_export.bundles.thresholds import Candidate, Joint, Rule, calibrated, se
 from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.data.splits import Kind, Split, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
+from cvo_export.vocabulary import GivenRotation
 
 Array = NDArray[np.float64]
-GivenRotation = Literal["tangent_predicted", "euler_zyx"]
 
 _FORMS = ({"pose": (1, 7)}, {"pose": (1, 7), "lower": (1, 6), "upper": (1, 6)})
 _FULL_TURN = float(np.pi)

@@ -34,9 +34,9 @@ from cvo_export.bundles.volume import ellipsoids_log_volume
 from cvo_export.data.noise import Noise, noisy
 from cvo_export.data.splits import Split, same_split
 from cvo_export.datasets import PoseDataset
+from cvo_export.vocabulary import Subset as Subset
 
 Array = NDArray[np.float64]
-Subset = Literal["test", "all"]
 # Of coverage: a band that holds, one that would if frames were independent draws, or none.
 Claim = Literal["exact", "indicative", "none"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -30,11 +30,11 @@ from cvo_edge.heads.cqr import Sides
 from cvo_edge.odometer import Observation, Odometer
 from cvo_edge.programs.selftest import observe_selftest
 from cvo_edge.sets import ConformalSet, Scope
+from cvo_edge.vocabulary import Joint as Joint
 from cvo_export.datasets import PoseDataset
+from cvo_export.vocabulary import Rule as Rule
 
 Array = NDArray[np.float64]
-Rule = Literal["pooled", "hierarchical"]
-Joint = Literal["max", "bonferroni"]
 
 SCOPES: tuple[Scope, Scope] = ("marginal", "joint")
 

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import SplitSpec
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.vocabulary import SplitKind
 from cvo_export.datasets import PoseDataset
 
-Kind = Literal["random", "block", "sequence"]
+Kind = SplitKind
 Purpose = Literal["training", "calibration"]
 SHARES: dict[Purpose, dict[str, float]] = {
     "training": {"train": 0.4, "fit": 0.1, "val": 0.1, "cal": 0.2, "test": 0.2},
