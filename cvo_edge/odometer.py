@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from operator import index
+from os import PathLike
 from pathlib import Path
 from threading import Lock
 from time import perf_counter
@@ -117,9 +118,9 @@ class Odometer:
     ) -> None:
         calibration = bundle.calibration
         self.calibration = calibration
-        self.confidence = confidence
+        self.threshold = calibration.stored_threshold(confidence, scope)
+        self.confidence = self.threshold.confidence
         self.scope = scope
-        self.threshold = self._stored_threshold(confidence, scope)
         self.head = consistent_head(calibration)
         model = bundle.model_bytes if isinstance(bundle, Bundle) else bundle.prepared
         self.mode = checked_mode(mode)
@@ -150,14 +151,14 @@ class Odometer:
     @classmethod
     def load(
         cls,
-        bundle: str | Path,
+        bundle: str | PathLike[str],
         *,
         threads: int | None = None,
         mode: Mode | str = Mode.LATENCY,
         confidence: float = 0.9,
         scope: Scope = "marginal",
         cache: ModelCache | None = None,
-        public_key: str | Path | None = None,
+        public_key: str | PathLike[str] | None = None,
     ) -> Odometer:
         """Read the bundle folder and be ready to step; parameters and errors as the class's.
 
@@ -199,6 +200,14 @@ class Odometer:
         if trust is not None:
             trust.remember()
         return odometer
+
+    def __repr__(self) -> str:
+        calibration = self.calibration
+        state = "" if self.session is not None else ", closed"
+        return (
+            f"<Odometer {calibration.name!r}: {calibration.method}, {self.confidence:g} "
+            f"{self.scope}, {self.mode} mode{state}>"
+        )
 
     def __enter__(self) -> Odometer:
         """Return itself."""
@@ -264,6 +273,11 @@ class Odometer:
         Images of your own may be written over once the next one is asked for.
         Raises what the source raises, and in ``live`` UsageError for a recording without stamps.
         """
+        if isinstance(frames, str | PathLike):
+            raise UsageError(
+                f"stream: expected frames or a source, found the path {frames}; use "
+                "odometer.stream(open_source(path))"
+            )
         self._stream_checks = StreamChecks()
         # What a camera gives has to be taken as it comes: what is left lying is old.
         if self.mode is Mode.LIVE or (isinstance(frames, Source) and frames.live):
@@ -414,16 +428,6 @@ class Odometer:
         return self.head.conformal_set(
             observation.outputs, observation.point, threshold or self.threshold
         )
-
-    def _stored_threshold(self, confidence: float, scope: Scope) -> Threshold:
-        threshold = self.calibration.threshold(confidence, scope)
-        if threshold is None:
-            stored = ", ".join(f"{value:g}" for value in self.calibration.confidences(scope))
-            raise UsageError(
-                f"confidence: expected one stored in the bundle for scope {scope} "
-                f"({stored or 'none'}), found {confidence:g}"
-            )
-        return threshold
 
     def _remarks(self, observation: Observation, found: ConformalSet) -> tuple[Reason, ...]:
         remarks: tuple[Reason, ...] = ()

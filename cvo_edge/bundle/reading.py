@@ -28,19 +28,23 @@ MAX_MODEL_BYTES = 1 << 30
 MAX_DEPTH = 16
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Bundle:
     """A bundle in memory: the calibration and the very bytes whose sha256 it names."""
 
     calibration: Calibration
     model_bytes: bytes
 
+    def __repr__(self) -> str:
+        name, method = self.calibration.name, self.calibration.method
+        return f"<Bundle {name!r}: {method}, model of {len(self.model_bytes) / 1e6:.1f} MB>"
+
 
 # What else may speak against a bundle: its folder, its calibration, the bytes it was read from.
 Check = Callable[[Path, Calibration, bytes], None]
 
 
-def read_bundle(folder: Path, check: Check | None = None) -> Bundle:
+def read_bundle(folder: str | os.PathLike[str], check: Check | None = None) -> Bundle:
     """Read and check a bundle folder; the model's bytes are read once and match their digest.
 
     With a ``check``, e.g. of a signature, that as well.
@@ -54,6 +58,7 @@ def read_bundle(folder: Path, check: Check | None = None) -> Bundle:
     BundleMismatchError
         The model is not the one that was calibrated; and what the check raises.
     """
+    folder = Path(folder)
     calibration = read_calibration(folder, check)
     path = folder / MODEL_FILE
     model_bytes = read_regular_file(path, MAX_MODEL_BYTES, ModelError)
