@@ -38,7 +38,7 @@ from cvo_edge.input import preprocess
 from cvo_edge.input.decoding import decode_image
 from cvo_edge.odometer import Odometer
 from cvo_edge.output.sinks import Sink
-from cvo_edge.sets import Scope
+from cvo_edge.vocabulary import Scope
 
 THREADS, ROUNDS, WARM_UP, BLOCKS = 2, 150, 20, 3
 PAIRS = (("record", "raw"), ("step", "pose_alone"), ("step", "raw"))

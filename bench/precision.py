@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from provenance import write_result
 
-from cvo_edge.bundle.format import Precision
 from cvo_edge.bundle.reading import read_calibration
+from cvo_edge.vocabulary import Precision
 from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.publish import publish

@@ -23,7 +23,7 @@ from cvo_edge.bundle.format import CONFIDENCES as LEVELS
 from cvo_edge.bundle.reading import encode_calibration, read_calibration
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.odometer import Odometer
-from cvo_edge.sets import Scope
+from cvo_edge.vocabulary import Scope
 from cvo_export.networks.directional import Choice, RegionNetwork
 from cvo_export.networks.heads import mcqr
 from cvo_export.publish import publish

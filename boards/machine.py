@@ -20,7 +20,7 @@ from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
-from cvo_edge.bundle.format import Precision
+from cvo_edge.vocabulary import Precision
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / ".boards"

@@ -1,4 +1,4 @@
-"""Conformalized visual odometry for the edge: a camera frame in, a pose with a true interval out.
+"""Conformalized visual odometry for the edge: a pose interval for every camera frame.
 
 from cvo_edge import Odometer
 
@@ -91,12 +91,17 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> Any:  # noqa: ANN401 - the type is that of the name
-    """Import a public name when it is first asked for.
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - a name of any type
+    """Import a public name on first use.
 
-    The command line sets up the environment of numpy and OpenCV first, and answers ``--version``
-    without either.
+    The command line sets the environment of numpy and OpenCV first and answers ``--version``
+    without importing either.
     """
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, for completion in an interactive session."""
+    return sorted([*__all__, "__version__", "__doc__"])

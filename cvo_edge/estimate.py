@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.errors import UsageError
 from cvo_edge.pose import Chart, Pose
-from cvo_edge.sets import Bands, ConformalSet, Scope
+from cvo_edge.sets import Bands, ConformalSet
+from cvo_edge.vocabulary import Scope
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration, Threshold
+from cvo_edge.bundle.format import Threshold
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.engine.session import Session
@@ -26,7 +26,8 @@ from cvo_edge.input.frame_checks import StreamChecks
 from cvo_edge.observer import Observation, Observer
 from cvo_edge.pose import Pose
 from cvo_edge.scheduling import checked_mode, plan, run_stream
-from cvo_edge.sets import SCOPES, ConformalSet, Scope, unbounded_set
+from cvo_edge.sets import ConformalSet, unbounded_set
+from cvo_edge.vocabulary import Scope
 
 _STEEP_PITCH = np.deg2rad(80.0)
 
@@ -88,7 +89,7 @@ class Odometer:
         calibration = bundle.calibration
         self.calibration = calibration
         self.head = bundle.head
-        self.threshold = _stored_threshold(calibration, confidence, scope)
+        self.threshold = calibration.stored_threshold(confidence, scope)
         self.confidence = self.threshold.confidence
         self.scope = scope
         self.mode = checked_mode(mode)
@@ -158,6 +159,14 @@ class Odometer:
             trust.remember()
         return odometer
 
+    def __repr__(self) -> str:
+        calibration = self.calibration
+        state = "" if self.session is not None else ", closed"
+        return (
+            f"<Odometer {calibration.name!r}: {calibration.method}, {self.confidence:g} "
+            f"{self.scope}, {self.mode} mode{state}>"
+        )
+
     def __enter__(self) -> Odometer:
         """Return itself."""
         return self
@@ -170,12 +179,6 @@ class Odometer:
     ) -> None:
         """Close it."""
         self.close()
-
-    def __repr__(self) -> str:
-        return (
-            f"<Odometer {self.calibration.name}: {self.calibration.method}, {self.confidence:g} "
-            f"{self.scope}, mode {self.mode}, {self.threads} thread(s)>"
-        )
 
     @property
     def session(self) -> Session | None:
@@ -237,8 +240,8 @@ class Odometer:
         """
         if isinstance(frames, str | bytes | os.PathLike):
             raise UsageError(
-                f"stream: expected a source or frames, found the path {os.fsdecode(frames)!r}; "
-                "open it with open_source"
+                f"stream: expected frames or a source, found the path {os.fsdecode(frames)}; use "
+                "odometer.stream(open_source(path))"
             )
         self._stream_checks = StreamChecks()
         with closing(
@@ -313,20 +316,3 @@ class Odometer:
         if self.chart.rotation == "euler_zyx" and abs(observation.point[4]) > _STEEP_PITCH:
             remarks += (Reason.PITCH_NEAR_90,)
         return remarks
-
-
-def _stored_threshold(calibration: Calibration, confidence: float, scope: Scope) -> Threshold:
-    if scope not in SCOPES:
-        raise UsageError(f"scope: expected one of {', '.join(SCOPES)}, found {scope!r}")
-    threshold = calibration.threshold(float(confidence), scope)
-    if threshold is not None:
-        return threshold
-    stored = calibration.confidences(scope)
-    below = [value for value in stored if value < confidence]
-    above = [value for value in stored if value > confidence]
-    nearest = " and ".join(f"{value:g}" for value in (*below[-1:], *above[:1]))
-    raise UsageError(
-        f"confidence: expected one stored in the bundle for scope {scope} "
-        f"({', '.join(f'{value:g}' for value in stored)}), found {confidence:g}; the nearest are "
-        f"{nearest}"
-    )

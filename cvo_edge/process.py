@@ -58,7 +58,10 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
     command = get_command(app)
     try:
         if sys.stdout is None:
-            raise SinkError("standard output: expected an open one, found it closed")
+            raise SinkError("standard output: expected an open stream, found it closed")
+        if f"_{program.replace('-', '_').upper()}_COMPLETE" in os.environ:
+            # The shell asks for completions; they are not commands of ours.
+            command.main(prog_name=program)
         # Not command.main(): it has exit codes of its own for signals and closed pipes.
         with command.make_context(program, sys.argv[1:] or ["--help"]) as context:
             command.invoke(context)
@@ -77,11 +80,16 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
         code = 128 + signal.SIGINT
     except Terminated:
         code = 128 + signal.SIGTERM
+    except SystemExit as leaving:
+        # rich ends the process itself where the reader of a help page has left.
+        if not isinstance(leaving.__context__, BrokenPipeError):
+            raise
+        code = 0
     except MemoryError:
-        code = _complain(program, "expected memory for what was asked, found none", 1)
+        code = _complain(program, "not enough memory for this command", 1)
     except Exception as error:
         if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
-            _leave(_complain(program, "expected threads to work with, found none", 1))
+            _leave(_complain(program, "no more threads can be started on this machine", 1))
         # A module in C that is being initialised makes an error of its own of what a signal raises.
         if _terminated.is_set():
             code = 128 + signal.SIGTERM

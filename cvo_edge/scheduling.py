@@ -22,7 +22,7 @@ from functools import partial
 from itertools import count
 from threading import Condition, Event, Thread
 from time import perf_counter
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +32,7 @@ from cvo_edge.errors import UsageError
 from cvo_edge.input.capture import READER
 from cvo_edge.input.frame import Frame, Source
 from cvo_edge.input.queue_lag import clock_s
-
-Mode = Literal["live", "latency", "throughput"]
-MODES: tuple[Mode, ...] = get_args(Mode)
+from cvo_edge.vocabulary import MODES, Mode
 
 Result = TypeVar("Result")
 # A frame and its number in the stream -> what is made of it.

@@ -12,11 +12,11 @@ import msgspec
 import pytest
 from hypothesis import settings
 
-from cvo_edge.bundle.format import CALIBRATION_FILE, Calibration, Joint, Threshold
+from cvo_edge.bundle.format import CALIBRATION_FILE, Calibration, Threshold
 from cvo_edge.bundle.reading import encode_calibration
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.heads import HEADS, Head
-from cvo_edge.sets import Scope
+from cvo_edge.vocabulary import Joint, Scope
 
 # Shared machines are slow now and then: a law that holds late still holds.
 settings.register_profile("project", deadline=None)

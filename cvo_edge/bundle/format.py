@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import msgspec
 from msgspec import Meta, Struct
 
-from cvo_edge.errors import CalibrationFileError
-from cvo_edge.input.preprocess import Crop
+from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.pose import Rotation
-from cvo_edge.sets import Scope
+from cvo_edge.vocabulary import Crop, Joint, Precision, Provider, Rule, Scope, SplitKind
 
 CALIBRATION_FILE = "calibration.json"
 MODEL_FILE: Literal["model.onnx"] = "model.onnx"
@@ -36,10 +35,6 @@ SixOrUnbounded = tuple[
     NumberOrNone, NumberOrNone, NumberOrNone, NumberOrNone, NumberOrNone, NumberOrNone
 ]
 Dtype = Literal["uint8", "float32"]
-Precision = Literal["fp32", "int8"]
-Provider = Literal["onnxruntime", "openvino"]
-Rule = Literal["pooled", "hierarchical"]
-Joint = Literal["max", "bonferroni"]
 Quaternion = tuple[Number, Number, Number, Number]
 Parameters = TypeVar("Parameters", bound=Struct)
 
@@ -134,7 +129,7 @@ class SplitSpec(_Strict, frozen=True):
     """
 
     purpose: Literal["training", "calibration"]
-    kind: Literal["random", "block", "sequence"]
+    kind: SplitKind
     seed: Annotated[int, Meta(ge=0)]
     sha256: Sha256
 
@@ -199,13 +194,37 @@ class Calibration(_Strict, frozen=True):
     digest: Sha256
 
     def threshold(self, confidence: float, scope: Scope) -> Threshold | None:
-        """Return the stored threshold for this confidence and scope, or None."""
+        """Return the stored threshold for this confidence and scope, or None.
+
+        A confidence in single precision is found as well.
+        """
         for entry in self.thresholds:
             if entry.scope == scope and math.isclose(
                 entry.confidence, confidence, abs_tol=_SAME_CONFIDENCE
             ):
                 return entry
         return None
+
+    def stored_threshold(self, confidence: float, scope: Scope) -> Threshold:
+        """Return the stored threshold; raises UsageError that names what is stored."""
+        if scope not in get_args(Scope):
+            raise UsageError(
+                f"scope: expected one of {', '.join(get_args(Scope))}, found {shown(scope)}"
+            )
+        try:
+            wanted = float(confidence)
+        except (TypeError, ValueError):
+            raise UsageError(f"confidence: expected a number, found {shown(confidence)}") from None
+        found = self.threshold(wanted, scope)
+        if found is not None:
+            return found
+        stored = self.confidences(scope)
+        nearest = [*[c for c in stored if c < wanted][-1:], *[c for c in stored if c > wanted][:1]]
+        raise UsageError(
+            f"confidence: {wanted:g} is not stored in the bundle for the {scope} scope; nearest: "
+            f"{' and '.join(f'{c:g}' for c in nearest) or 'none'}; stored: "
+            f"{', '.join(f'{c:g}' for c in stored) or 'none'}"
+        )
 
     def confidences(self, scope: Scope) -> tuple[float, ...]:
         """Return the confidences stored for this scope, ascending."""

@@ -101,8 +101,8 @@ class ModelCache:
         Made when the first model is kept. One that others may write to is not used.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
 
     @classmethod
     def default(cls) -> ModelCache:

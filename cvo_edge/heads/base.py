@@ -10,10 +10,11 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Joint, Threshold
+from cvo_edge.bundle.format import Threshold
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
-from cvo_edge.sets import ConformalSet, Scope
+from cvo_edge.sets import ConformalSet
+from cvo_edge.vocabulary import Joint, Scope
 
 Array = NDArray[np.float64]
 

@@ -22,19 +22,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Joint, SixOrUnbounded, SixPositive, Threshold
+from cvo_edge.bundle.format import SixOrUnbounded, SixPositive, Threshold
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads.base import Candidate, Head
-from cvo_edge.sets import ConformalSet, Scope
+from cvo_edge.sets import ConformalSet
+from cvo_edge.vocabulary import Joint, Scope, Sides
 
 Array = NDArray[np.float64]
-Sides = Literal["symmetric", "asymmetric", "lower", "upper"]
 
 _POINT: dict[str, tuple[int, ...]] = {"pose": (1, 7)}
 _BOUNDED: dict[str, tuple[int, ...]] = {**_POINT, "lower": (1, 6), "upper": (1, 6)}

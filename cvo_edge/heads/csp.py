@@ -30,7 +30,8 @@ from cvo_edge.conformal import JointScale, RankScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads.base import Candidate, Head
 from cvo_edge.heads.cqr import infinite_where_null
-from cvo_edge.sets import ConformalSet, Scope
+from cvo_edge.sets import ConformalSet
+from cvo_edge.vocabulary import Scope
 
 Array = NDArray[np.float64]
 Score = Literal["lac", "aps", "raps"]

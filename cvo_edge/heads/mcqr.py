@@ -26,12 +26,13 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Joint, SixPositive, Threshold
+from cvo_edge.bundle.format import SixPositive, Threshold
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads.base import Candidate, Head
 from cvo_edge.heads.cqr import IntervalScore, infinite_where_null, refuse_negative
-from cvo_edge.sets import ConformalSet, Ellipsoids, Scope, scaled_distance, unbounded_set
+from cvo_edge.sets import ConformalSet, Ellipsoids, scaled_distance, unbounded_set
+from cvo_edge.vocabulary import Joint, Scope
 
 Array = NDArray[np.float64]
 

@@ -7,15 +7,14 @@ which an 8-bit network amplifies. Halving first also keeps the linear step from 
 
 from __future__ import annotations
 
-from typing import Literal
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.vocabulary import Crop
+
 Image = NDArray[np.uint8]
 
-Crop = Literal["none", "centre"]
 
 MIN_SIDE = 16
 

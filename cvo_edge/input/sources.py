@@ -5,16 +5,18 @@ from __future__ import annotations
 import glob
 import logging
 import math
+import os
 import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from operator import index
 from pathlib import Path
 from threading import Event
 from time import perf_counter
-from typing import TypeVar
+from typing import SupportsIndex, TypeVar
 
 from cvo_edge.errors import SourceError, UsageError, printable
 from cvo_edge.files import read_regular_file
@@ -38,28 +40,30 @@ _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_S) -> Source:
-    """Guess from what ``text`` is: a folder, a glob, a video file, a camera or a stream.
+def open_source(
+    source: str | os.PathLike[str] | int, fps: float | None = None, timeout_s: float = TIMEOUT_S
+) -> Source:
+    """Open a folder of images, a glob, a video file, a camera or a stream.
 
     Parameters
     ----------
-    text
-        Folder of images (natural order; only ``*.color.*`` where there are any, never
-        ``*.depth.*``, nor hidden files), a glob pattern, a video file, a camera index such as
-        ``0``, a device path such as ``/dev/video0``, a named pipe, or the address of a stream such
-        as ``rtsp://...``.
+    source
+        Folder of images (natural order; only ``*.color.*`` if there are any, never ``*.depth.*`` or
+        hidden files), a glob pattern, a video file, a camera index such as ``0``, a device path
+        such as ``/dev/video0``, a named pipe, or the address of a stream such as ``rtsp://...``.
     fps
         Frames per second to stamp frames with, starting at zero, instead of the source's own.
     timeout_s
-        How long to wait for the next frame of a video or camera, twice that for it to open.
+        Longest wait for the next frame of a video or camera; opening may take twice as long.
 
     Raises
     ------
     SourceError
         There is no such source, or no image in it.
     UsageError
-        ``fps`` or ``timeout_s`` is out of range.
+        ``source`` is of another type, or ``fps`` or ``timeout_s`` is out of range.
     """
+    text = _text(source)
     if fps is not None and not LOWEST_FPS <= fps <= HIGHEST_FPS:
         raise UsageError(f"fps: expected {LOWEST_FPS:g} to {HIGHEST_FPS:g}, found {fps:g}")
     if not 0.0 < timeout_s <= LONGEST_S:
@@ -88,6 +92,16 @@ def open_source(text: str, fps: float | None = None, timeout_s: float = TIMEOUT_
         f"{shown(text)}: expected a folder, glob, video file, camera index or device, found none "
         "of these"
     )
+
+
+def _text(source: str | os.PathLike[str] | int) -> str:
+    try:
+        text = str(index(source)) if isinstance(source, SupportsIndex) else os.fspath(source)
+    except TypeError:
+        text = None
+    if not isinstance(text, str):
+        raise UsageError(f"source: expected a path, an address or a camera index, found {source!r}")
+    return text
 
 
 def names_camera(text: str) -> bool:

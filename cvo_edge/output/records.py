@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from msgspec import Struct
 from cvo_edge.errors import SourceError
 from cvo_edge.estimate import Reason, Status
 from cvo_edge.pose import Rotation
-from cvo_edge.sets import Scope
+from cvo_edge.vocabulary import Scope
 
 Six = tuple[float, float, float, float, float, float]
 SixOrUnbounded = tuple[
@@ -64,7 +65,7 @@ class Record(_Strict, frozen=True):
 _DECODER = msgspec.json.Decoder(Record)
 
 
-def read_records(path: str | Path) -> Iterator[Record]:
+def read_records(path: str | PathLike[str]) -> Iterator[Record]:
     """Yield the records of a file of JSON lines, in its order.
 
     A last line without its end, of a run that was killed or lost its power or disk, is left out:

@@ -12,14 +12,12 @@ import stat
 import sys
 from collections.abc import Callable, Iterable
 from types import TracebackType
-from typing import Literal
 
 import msgspec
 
 from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.estimate import PoseInterval
-
-Format = Literal["jsonl", "csv", "tum", "table"]
+from cvo_edge.vocabulary import Format
 
 _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
 

@@ -32,7 +32,7 @@ from cvo_edge.programs.measure import (
     waited_for_cores_s,
 )
 from cvo_edge.scheduling import AHEAD
-from cvo_edge.sets import Scope
+from cvo_edge.vocabulary import Scope
 
 # A common camera's frame, used where no source is given, and its rate.
 _DEFAULT_HEIGHT, _DEFAULT_WIDTH = 480, 640

@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import json
 import os
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -14,47 +13,30 @@ import typer
 from cvo_edge.errors import GateError, SinkError, SourceError, UsageError
 from cvo_edge.files import write_text
 from cvo_edge.process import guarded, say
+from cvo_edge.vocabulary import Format, Mode, Scope
 
 if TYPE_CHECKING:
     from cvo_edge.engine.model_cache import ModelCache
 
 app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
+    rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     help="Pose intervals from camera images: a 6-DoF pose per frame and, for each degree of "
     "freedom, an interval that holds the truth with a stated probability.",
 )
 
-
-class ScopeName(StrEnum):
-    """For each degree of freedom, or for all six at once."""
-
-    MARGINAL = "marginal"
-    JOINT = "joint"
-
-
-class ModeName(StrEnum):
-    """What a stream is to be good at."""
-
-    LIVE = "live"
-    LATENCY = "latency"
-    THROUGHPUT = "throughput"
-
-
-class FormatName(StrEnum):
-    """Output formats."""
-
-    JSONL = "jsonl"
-    CSV = "csv"
-    TUM = "tum"
-    TABLE = "table"
-
-
 # A thousand years of a camera; as many times as fit into memory.
 MOST_FRAMES, MOST_MEASURED = 10**12, 10**7
 
-# readable: what cannot be read has an exit code of ours.
+_INTERVALS, _RUNTIME, _REPORT = "Intervals", "Runtime", "Output"
+
+
+def examples(*commands: str) -> str:
+    """Return the epilog that lists commands, one a line."""
+    return "\n\n".join(["Examples:", *commands])
+
+
+# readable: a file that cannot be read has an exit code of ours.
 BundleArgument = Annotated[
     Path,
     typer.Argument(
@@ -62,20 +44,24 @@ BundleArgument = Annotated[
     ),
 ]
 ThreadsOption = Annotated[
-    int | None, typer.Option(help="Cores to use; all allowed ones by default.")
+    int | None,
+    typer.Option(help="Cores to use; default: all allowed.", rich_help_panel=_RUNTIME),
 ]
 CacheOption = Annotated[
     bool,
     typer.Option(
-        "--cache/--no-cache", help="Keep the model as it is prepared for this machine, see cache."
+        "--cache/--no-cache",
+        help="Keep an optimised copy of the model for later starts; see the command cache.",
+        rich_help_panel=_RUNTIME,
     ),
 ]
 PublicKeyOption = Annotated[
     Path | None,
     typer.Option(
-        help="Ed25519 key (PEM): take a bundle only if it is signed with it.",
+        help="Accept only a bundle signed with this Ed25519 key (PEM).",
         readable=False,
         show_default=False,
+        rich_help_panel=_RUNTIME,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -101,52 +87,91 @@ def demonstrate(
     demo(bundle or BUNDLE, picture)
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "cvo-edge run my-bundle recordings/flight-07 -o flight-07.jsonl",
+        "cvo-edge run my-bundle /dev/video0 --scope joint --format table",
+        "cvo-edge run my-bundle images/ --ground-truth images/ -o out.jsonl",
+    )
+)
 def run(
     bundle: BundleArgument,
     source: Annotated[
         str,
         typer.Argument(
-            help="Folder of images, glob, video file, camera index or device, address of a stream.",
+            help="Folder of images, glob, video file, camera index or device, or stream address.",
             show_default=False,
         ),
     ],
-    output: Annotated[str, typer.Option("-o", "--output", help="File, or - for stdout.")] = "-",
-    format: Annotated[FormatName, typer.Option(help="Output format.")] = FormatName.JSONL,
-    confidence: Annotated[float, typer.Option(help="One of those stored in the bundle.")] = 0.9,
-    scope: Annotated[
-        ScopeName, typer.Option(help="Each degree of freedom, or all six at once.")
-    ] = ScopeName.MARGINAL,
-    mode: Annotated[
-        ModeName | None,
+    output: Annotated[
+        str,
+        typer.Option("-o", "--output", help="File, or - for stdout.", rich_help_panel=_REPORT),
+    ] = "-",
+    format: Annotated[
+        Format, typer.Option(help="Format of the records.", rich_help_panel=_REPORT)
+    ] = "jsonl",
+    region: Annotated[
+        bool,
         typer.Option(
-            help="live: the newest frame, with little processor time; latency: one frame after the "
-            "other, each as fast as can be; throughput: most frames a second. By default live for "
-            "a camera, else latency.",
-            show_default=False,
+            "--region",
+            help="Write the region's points into every record (mcqr, joint scope).",
+            rich_help_panel=_REPORT,
         ),
-    ] = None,
-    threads: ThreadsOption = None,
-    max_frames: Annotated[
-        int | None, typer.Option(min=1, max=MOST_FRAMES, help="Stop after so many.")
-    ] = None,
-    fps: Annotated[float | None, typer.Option(help="Stamp frames at this rate from zero.")] = None,
-    timeout: Annotated[
-        float, typer.Option(help="Seconds to wait for the next frame of a camera or video.")
-    ] = 5.0,
+    ] = False,
     ground_truth: Annotated[
         Path | None,
         typer.Option(
-            help="TUM file or folder of .pose.txt; the summary then shows coverage.", readable=False
+            help="TUM file or folder of .pose.txt; adds coverage to the summary.",
+            readable=False,
+            rich_help_panel=_REPORT,
         ),
     ] = None,
-    region: Annotated[
+    quiet: Annotated[
         bool,
-        typer.Option("--region", help="mcqr, scope joint: the region's points in every record."),
+        typer.Option("--quiet", help="No progress or summary.", rich_help_panel=_REPORT),
     ] = False,
+    confidence: Annotated[
+        float,
+        typer.Option(help="A confidence stored in the bundle.", rich_help_panel=_INTERVALS),
+    ] = 0.9,
+    scope: Annotated[
+        Scope,
+        typer.Option(
+            help="Whether it holds for each degree of freedom or for all six at once.",
+            rich_help_panel=_INTERVALS,
+        ),
+    ] = "marginal",
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Stamp frames at this rate, from zero.", rich_help_panel="Input"),
+    ] = None,
+    max_frames: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=MOST_FRAMES, help="Stop after this many frames.", rich_help_panel="Input"
+        ),
+    ] = None,
+    timeout: Annotated[
+        float,
+        typer.Option(
+            help="Seconds to wait for the next frame of a camera or video.",
+            rich_help_panel="Input",
+        ),
+    ] = 5.0,
+    mode: Annotated[
+        Mode | None,
+        typer.Option(
+            metavar="<mode>",
+            help="live: newest frame, least processor time; latency: every frame, each as fast as "
+            "possible; throughput: most frames per second. Default: live for a camera, else "
+            "latency.",
+            show_default=False,
+            rich_help_panel=_RUNTIME,
+        ),
+    ] = None,
+    threads: ThreadsOption = None,
     cache: CacheOption = True,
     public_key: PublicKeyOption = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No summary on stderr.")] = False,
 ) -> None:
     """Estimate a pose interval for every frame of a source."""
     from cvo_edge.ground_truth import open_ground_truth
@@ -154,6 +179,7 @@ def run(
     from cvo_edge.input.sources import open_source
     from cvo_edge.odometer import Odometer
     from cvo_edge.output.sinks import Sink
+    from cvo_edge.programs.progress import frames_progress
     from cvo_edge.programs.run import RunSummary
     from cvo_edge.programs.run import run as run_frames
 
@@ -163,28 +189,31 @@ def run(
     with Odometer.load(
         bundle,
         threads=threads,
-        mode=mode or (ModeName.LIVE if frames.live else ModeName.LATENCY),
+        mode=mode or ("live" if frames.live else "latency"),
         confidence=confidence,
-        scope=scope.value,
+        scope=scope,
         cache=_model_cache(cache),
         public_key=public_key,
     ) as odometer:
         if region and not odometer.has_region:
             raise UsageError(
-                f"region: expected a bundle of mcqr and the scope joint, found "
-                f"{odometer.calibration.method} and {scope.value}"
+                f"--region: expected a bundle of mcqr and the joint scope, found "
+                f"{odometer.calibration.method} and {scope}"
             )
         summary = RunSummary(odometer.chart.dof, confidence, scope, with_truth=truth is not None)
-        with Sink(output, format.value, region=region) as sink:
+        watched = output != "-" and not quiet
+        with Sink(output, format, region=region) as sink:
             try:
-                run_frames(
-                    odometer,
-                    frames,
-                    sink.write,
-                    summary=summary,
-                    truth=truth,
-                    max_frames=max_frames,
-                )
+                with frames_progress(watched, summary, frames.length, max_frames) as tick:
+                    run_frames(
+                        odometer,
+                        frames,
+                        sink.write,
+                        summary=summary,
+                        truth=truth,
+                        max_frames=max_frames,
+                        tick=tick,
+                    )
             finally:
                 if not quiet and summary.frames:
                     say("\n".join(summary.lines()))
@@ -194,32 +223,43 @@ def run(
         )
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "cvo-edge bench my-bundle",
+        "cvo-edge bench my-bundle flight.mp4 --mode throughput --json bench.json",
+        "cvo-edge bench my-bundle --max-p95-ms 40 --max-rss-mib 200",
+    )
+)
 def bench(
     bundle: BundleArgument,
     source: Annotated[
-        str | None, typer.Argument(help="As for run; a still 640x480 image by default.")
+        str | None, typer.Argument(help="As for run; default: a fixed 640x480 image.")
     ] = None,
-    frames: Annotated[int, typer.Option(min=1, max=MOST_MEASURED, help="Frames that count.")] = 200,
+    frames: Annotated[int, typer.Option(min=1, max=MOST_MEASURED, help="Frames to measure.")] = 200,
     warmup: Annotated[
-        int, typer.Option(min=0, max=MOST_MEASURED, help="Frames before those.")
+        int, typer.Option(min=0, max=MOST_MEASURED, help="Frames to run before measuring.")
     ] = 20,
     mode: Annotated[
-        ModeName, typer.Option(help="As for run; live plays files at 30 frames a second.")
-    ] = ModeName.LATENCY,
+        Mode, typer.Option(help="As for run; live plays files at 30 frames a second.")
+    ] = "latency",
     threads: ThreadsOption = None,
     cache: CacheOption = True,
     json_file: Annotated[
-        str | None, typer.Option("--json", help="Write the report as JSON to a file or -.")
+        str | None,
+        typer.Option(
+            "--json", help="Write the report as JSON to a file or -.", rich_help_panel=_REPORT
+        ),
     ] = None,
     max_p95_ms: Annotated[
-        float | None, typer.Option(help="Exit 8 where the total's p95 is longer.")
+        float | None,
+        typer.Option(help="Exit 8 if the total's p95 is longer.", rich_help_panel="Gates"),
     ] = None,
     max_rss_mib: Annotated[
-        float | None, typer.Option(help="Exit 8 where peak memory is larger.")
+        float | None,
+        typer.Option(help="Exit 8 if peak memory is larger.", rich_help_panel="Gates"),
     ] = None,
 ) -> None:
-    """Measure latency, memory and processor time, beside the bare model call."""
+    """Measure latency, memory and processor time next to the bare model call."""
     from cvo_edge.programs.bench import benchmark, benchmark_lines
 
     if json_file is not None:
@@ -250,13 +290,13 @@ def verify(
     threads: ThreadsOption = None,
     public_key: PublicKeyOption = None,
     timeout: Annotated[
-        float, typer.Option(help="Seconds that loading and self-test may take.")
+        float, typer.Option(help="Seconds allowed for loading and self-test.")
     ] = 60.0,
 ) -> None:
     """Check every digest of a bundle, load it and run its self-test on this machine.
 
-    Of the model as it is, and as the cache has it prepared, where it has; in a process of its own,
-    with limits of time and memory.
+    The self-test runs on the model and on its cached copy, if there is one,
+    in a separate process with limits of time and memory.
     """
     from cvo_edge.programs.verify import verify_bundle
 
@@ -266,7 +306,7 @@ def verify(
 
 @app.command()
 def inspect(bundle: BundleArgument, as_json: JsonOption = False) -> None:
-    """Show what a bundle is: method, model, thresholds, where they come from."""
+    """Show a bundle: method, model, thresholds and the calibration behind them."""
     import msgspec
 
     from cvo_edge.bundle.reading import read_calibration
@@ -289,7 +329,7 @@ def schema() -> None:
 
 @app.command()
 def doctor(as_json: JsonOption = False) -> None:
-    """Show what this machine offers: processor, cores, versions, memory."""
+    """Show processor, cores, memory and versions of this machine."""
     from cvo_edge.programs.inspect import doctor_lines
     from cvo_edge.programs.measure import environment, memory_mib
 
@@ -302,10 +342,10 @@ def doctor(as_json: JsonOption = False) -> None:
 
 @app.command()
 def cache(
-    clear: Annotated[bool, typer.Option("--clear", help="Remove all of them.")] = False,
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all copies.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """List the models that were prepared for this machine (in $CVO_EDGE_CACHE, or ~/.cache)."""
+    """List the optimised models of this machine (in $CVO_EDGE_CACHE or ~/.cache)."""
     import msgspec
 
     from cvo_edge.engine.model_cache import ModelCache
@@ -354,7 +394,7 @@ def _root(
 
 
 def _refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
-    """Raise UsageError where the output is one of the inputs, or lies in one or behind its glob."""
+    """Raise UsageError if the output is an input, or lies in an input's folder or glob."""
     written = Path(output)
     if output == "-" or not os.path.exists(written):  # noqa: PTH110 - also of a name too long
         return
@@ -364,7 +404,7 @@ def _refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
         name = str(given)
         files = [name, *glob.iglob(name, recursive=True), *glob.iglob(f"{glob.escape(name)}/*")]
         if any(os.path.exists(file) and written.samefile(file) for file in files):  # noqa: PTH110
-            raise UsageError(f"output: expected a file of its own, found {output} among the input")
+            raise UsageError(f"output: expected a new file, found {output} among the inputs")
 
 
 def main() -> NoReturn:

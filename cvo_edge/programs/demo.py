@@ -16,7 +16,7 @@ from cvo_edge.output.picture import draw_run, write_png
 from cvo_edge.output.sinks import Sink
 from cvo_edge.programs.run import RunSummary, run
 from cvo_edge.programs.verify import verify_bundle
-from cvo_edge.sets import Scope
+from cvo_edge.vocabulary import Scope
 
 PACKAGED = Path(__file__).resolve().parent.parent / "demonstration"
 BUNDLE, CLIP, EXPECTED = (PACKAGED / n for n in ("bundle", "clip", "expected_coverage.json"))

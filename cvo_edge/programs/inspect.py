@@ -1,8 +1,9 @@
-"""What a person asks of a bundle or a machine, as lines of text, and the JSON Schema."""
+"""Descriptions of a bundle and of a machine as lines of text, and the JSON Schema."""
 
 from __future__ import annotations
 
 import math
+from textwrap import wrap
 from typing import Any
 
 import msgspec
@@ -22,28 +23,46 @@ def inspect_lines(calibration: Calibration) -> list[str]:
     tensors = ", ".join(f"{t.name} {list(t.shape)}" for t in (*model.inputs, *model.outputs))
     dof = Chart(pose.rotation).dof
     lines = [
-        f"name         {calibration.name}",
-        f"method       {calibration.method}, {source.score} score{details}",
-        f"model        {model.precision}, opset {model.opset}, sha256 {model.sha256[:16]}..., "
-        f"on {model.provider}",
-        f"tensors      {tensors}",
-        f"pose         {pose.target}, {pose.child_frame_id} in {pose.frame_id}, {pose.rotation}",
-        f"calibrated   on {source.n} frames of {source.n_sequences} sequence(s) of "
-        f"{source.dataset}, split {source.split.kind} (seed {source.split.seed}), {source.rule}"
-        + _worth(source),
-        f"joint        by {head.joint_description(source.joint)}",
-        f"backbone     {calibration.provenance.backbone or 'a given network'}",
+        *_entry("name", calibration.name),
+        *_entry("method", f"{calibration.method}, {source.score} score{details}"),
+        *_entry(
+            "model",
+            f"{model.precision}, opset {model.opset}, sha256 {model.sha256[:16]}..., "
+            f"on {model.provider}",
+        ),
+        *_entry("tensors", tensors),
+        *_entry(
+            "pose", f"{pose.target}, {pose.child_frame_id} in {pose.frame_id}, {pose.rotation}"
+        ),
+        *_entry(
+            "calibrated",
+            f"on {source.n} frames of {source.n_sequences} sequence(s) of {source.dataset}, split "
+            f"{source.split.kind} (seed {source.split.seed}), {source.rule}{_worth(source)}",
+        ),
+        *_entry("joint", f"by {head.joint_description(source.joint)}"),
+        *_entry("backbone", calibration.provenance.backbone or "a given network"),
         "",
-        f"{'q_hat at':<16}" + "".join(f"{name:>11}" for name in dof),
+        f"{'q_hat at':<18}" + "".join(f"{name:>10}" for name in dof),
     ]
     for entry in calibration.thresholds:
         sides = [("", entry.q_hat)]
         if entry.q_hat_upper is not None:
             sides = [(" low", entry.q_hat), (" high", entry.q_hat_upper)]
         for side, values in sides:
-            cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>11}" for v in values)
-            lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<16}" + cells)
+            cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>10}" for v in values)
+            lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<18}" + cells)
     return lines + _unbounded(calibration, head)
+
+
+def _entry(label: str, text: str) -> list[str]:
+    """Lines of at most 80 columns, the label before the first."""
+    return wrap(
+        text,
+        80,
+        initial_indent=f"{label:<13}",
+        subsequent_indent=" " * 13,
+        break_on_hyphens=False,
+    )
 
 
 def _unbounded(calibration: Calibration, head: Head) -> list[str]:
@@ -71,7 +90,7 @@ def _unbounded(calibration: Calibration, head: Head) -> list[str]:
         reason = f"needs at least {needed} calibration {unit}, has {given}"
         if given >= needed:
             reason = head.infinite_score
-        lines.append(f"unbounded    at {entry.confidence:g} {entry.scope}: {reason}")
+        lines += _entry("unbounded", f"at {entry.confidence:g} {entry.scope}: {reason}")
     return lines
 
 
@@ -86,27 +105,27 @@ def doctor_lines(report: dict[str, Any]) -> list[str]:
     """Return the environment for a person."""
     versions = ", ".join(f"{name} {value}" for name, value in report["versions"].items())
     return [
-        f"processor    {report['cpu']} ({report['architecture']})",
-        f"cores        {report['cores_allowed']} allowed of {report['cores_present']} present",
-        f"governor     {report['governor'] or 'not readable'}",
-        f"system       {report['system']}",
-        f"memory       {report['memory_available_mib']:.0f} MiB available",
-        f"load         {' '.join(f'{value:.2f}' for value in report['load_average'])}",
-        f"versions     {versions}",
+        *_entry("processor", f"{report['cpu']} ({report['architecture']})"),
+        *_entry("cores", f"{report['cores_allowed']} allowed of {report['cores_present']} present"),
+        *_entry("governor", report["governor"] or "not readable"),
+        *_entry("system", report["system"]),
+        *_entry("memory", f"{report['memory_available_mib']:.0f} MiB available"),
+        *_entry("load", " ".join(f"{value:.2f}" for value in report["load_average"])),
+        *_entry("versions", versions),
     ]
 
 
 def cache_lines(cache: ModelCache) -> list[str]:
     """Return what a cache holds for a person."""
     entries = cache.entries()
-    lines = [f"folder       {cache.folder}, {len(entries)} prepared model(s)"]
+    lines = _entry("folder", f"{cache.folder}, {len(entries)} optimised model(s)")
     obstacle = cache.obstacle()
     if obstacle is not None:
-        lines.append(f"not used     {obstacle}")
+        lines += _entry("not used", obstacle)
     for entry in entries:
         made = f"sha256 {entry.model_sha256[:16]}..., onnxruntime {entry.onnxruntime}"
         other = "" if entry.current else ", of another machine or release"
-        lines.append(f"{entry.megabytes:9.1f} MB {entry.name} ({made}{other})")
+        lines += _entry(f"{entry.megabytes:9.1f} MB", f"{entry.name} ({made}{other})")
     return lines
 
 

@@ -115,12 +115,16 @@ def run(
     summary: RunSummary,
     truth: GroundTruth | None = None,
     max_frames: int | None = None,
+    tick: Callable[[], None] | None = None,
 ) -> None:
-    """Step through ``frames``, write each estimate, and count it in ``summary``.
+    """Step through ``frames``, write each estimate and count it in ``summary``.
 
-    The summary is the caller's, so that it can still be shown when a source ends early.
+    The caller owns the summary, so that it can still be shown when a source ends early. ``tick`` is
+    called after each frame.
     """
     with closing(odometer.stream(frames)) as estimates:
         for estimate in islice(estimates, max_frames):
             write(estimate)
             summary.add(estimate, truth.pose_of(estimate) if truth else None)
+            if tick is not None:
+                tick()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 import numpy as np
@@ -19,21 +18,18 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import (
     Calibration,
-    Joint,
     PoseLimits,
     PoseSpec,
     PreprocessSpec,
     Provenance,
-    Provider,
-    Rule,
     TensorSpec,
 )
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageError
 from cvo_edge.geometry import mean_rotation
 from cvo_edge.heads import Candidate
-from cvo_edge.heads.cqr import CqrParameters, Sides
-from cvo_edge.input.preprocess import Crop
+from cvo_edge.heads.cqr import CqrParameters
+from cvo_edge.vocabulary import Crop, Joint, Provider, Rule, Sides, SplitKind
 from cvo_export.bundles.draft import (
     CAMERA_FRAME,
     FEW_POSES_MARGIN,
@@ -49,11 +45,11 @@ from cvo_export.bundles.draft import (
 )
 from cvo_export.bundles.thresholds import calibrated, selected
 from cvo_export.bundles.writing import check_target, write_bundle
-from cvo_export.data.splits import Kind, Split, default_kind, make_split, same_split
+from cvo_export.data.splits import Split, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
+from cvo_export.vocabulary import GivenRotation
 
 Array = NDArray[np.float64]
-GivenRotation = Literal["tangent_predicted", "euler_zyx"]
 
 _FORMS = ({"pose": (1, 7)}, {"pose": (1, 7), "lower": (1, 6), "upper": (1, 6)})
 _FULL_TURN = float(np.pi)
@@ -67,7 +63,7 @@ def calibrate(
     bundle_dir: Path,
     name: str,
     *,
-    kind: Kind | None = None,
+    kind: SplitKind | None = None,
     seed: int | None = None,
     rule: Rule | None = None,
     joint: Joint = "max",
@@ -141,7 +137,7 @@ def calibrate(
 def _split_of(
     calibration: Calibration,
     dataset: PoseDataset,
-    kind: Kind | None,
+    kind: SplitKind | None,
     seed: int | None,
     new_data: bool,
 ) -> Split:
@@ -166,7 +162,7 @@ def _split_of(
     return split
 
 
-def _new_split(dataset: PoseDataset, kind: Kind | None, seed: int | None) -> Split:
+def _new_split(dataset: PoseDataset, kind: SplitKind | None, seed: int | None) -> Split:
     kind = kind or default_kind(dataset, "calibration")
     return make_split(dataset, kind, seed or 0, "calibration")
 

@@ -5,223 +5,85 @@ from __future__ import annotations
 import json
 import sys
 from contextlib import nullcontext
-from enum import StrEnum
 from functools import partial
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
+from typer.core import TyperCommand
 
 from cvo_edge.errors import UsageError
 from cvo_edge.files import write_text
 from cvo_edge.process import guarded, quiet_libraries
-from cvo_edge.programs.cli import ScopeName
+from cvo_edge.programs.cli import examples
+from cvo_edge.vocabulary import Crop, Joint, Precision, Provider, Rule, Scope, Sides, SplitKind
 from cvo_export.progress import show_progress
+from cvo_export.vocabulary import GivenRotation, Normalisation, StudyEngine, Subset
 
 if TYPE_CHECKING:
     from cvo_export.datasets import PoseDataset
 
 app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
+    rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    help="Train a pose network with bounds, export it to one ONNX graph, calibrate it, evaluate "
-    "it. DATASET is FORMAT:PATH, e.g. 7scenes:scenes/redkitchen or synthetic:room; formats are "
+    help="Train a pose network with bounds, export it to one ONNX graph, calibrate and evaluate "
+    "it. DATASET is FORMAT:PATH, e.g. 7scenes:scenes/redkitchen or synthetic:room; the formats are "
     "7scenes, rgbd-scenes, tum, kitti, euroc and synthetic.",
 )
 
-
-class MethodName(StrEnum):
-    """Methods that can be trained, and baselines."""
-
-    CJP = "cjp"
-    CQR = "cqr"
-    CSP = "csp"
-    MCQR = "mcqr"
-    MC_DROPOUT = "mc-dropout"
-    ENSEMBLE = "ensemble"
-    GAUSSIAN = "gaussian"
-    MDN = "mdn"
-    PINBALL = "pinball"
-    SPLIT = "split"
-
-
-class EngineName(StrEnum):
-    """Where the cells of a study are run."""
-
-    LOCAL = "local"
-    RAY = "ray"
-
-
-class SplitName(StrEnum):
-    """How frames get their roles."""
-
-    RANDOM = "random"
-    BLOCK = "block"
-    SEQUENCE = "sequence"
-
-
-class CropName(StrEnum):
-    """What the model sees of an image."""
-
-    NONE = "none"
-    CENTRE = "centre"
-
-
-class NormalisationName(StrEnum):
-    """Mean and deviation that pixels are normalised with."""
-
-    HALF = "half"
-    TIMM = "timm"
-
-
-class LatentName(StrEnum):
-    """What inference draws from the latent Gaussian."""
-
-    MEAN = "mean"
-    CODEBOOK = "codebook"
-    SAMPLE = "sample"
-
-
-class BoundsName(StrEnum):
-    """How the network gives its bounds."""
-
-    SOFTPLUS = "softplus"
-    FREE = "free"
-
-
-class PointLossName(StrEnum):
-    """Loss of the point."""
-
-    ABSOLUTE = "absolute"
-    SQUARED = "squared"
-
-
-class GateName(StrEnum):
-    """Which coverage gates the calibration loss."""
-
-    CORRECTED = "corrected"
-    LITERAL = "literal"
-
-
-class IntervalFormName(StrEnum):
-    """Which reading of the interval score trains the bounds."""
-
-    PROPER = "proper"
-    MEAN = "mean"
-    SUM = "sum"
-
-
-class LabelsName(StrEnum):
-    """What the classifier is trained to answer."""
-
-    ORDINAL = "ordinal"
-    ONE_HOT = "one_hot"
-
-
-class ForestName(StrEnum):
-    """One forest for all degrees of freedom, or one each."""
-
-    SHARED = "shared"
-    PER_DOF = "per_dof"
-
-
-class ResidualsName(StrEnum):
-    """Which frames the forest's residuals come from."""
-
-    AUTO = "auto"
-    CROSS_FITTED = "cross_fitted"
-    HELD_OUT = "held_out"
-
-
-class AugmentationName(StrEnum):
-    """What MC-dropout passes add to the training data of a region."""
-
-    NONE = "none"
-    PREDICTIONS = "predictions"
-    LABELS = "labels"
-
-
-class ScaleName(StrEnum):
-    """What decides the unit of a region's codebook."""
-
-    LOCAL = "local"
-    CONSTANT = "constant"
-
-
-class ProviderName(StrEnum):
-    """The engine that a bundle is calibrated on, and runs on."""
-
-    ONNXRUNTIME = "onnxruntime"
-    OPENVINO = "openvino"
-
-
-class PrecisionName(StrEnum):
-    """Of the backbone's numbers."""
-
-    FP32 = "fp32"
-    INT8 = "int8"
-
-
-class JointName(StrEnum):
-    """How six scores become the joint scope."""
-
-    MAX = "max"
-    BONFERRONI = "bonferroni"
-
-
-class SidesName(StrEnum):
-    """Which bounds are calibrated, and how."""
-
-    SYMMETRIC = "symmetric"
-    ASYMMETRIC = "asymmetric"
-    LOWER = "lower"
-    UPPER = "upper"
-
-
-class RotationName(StrEnum):
-    """What the rotation numbers of a given network are."""
-
-    TANGENT_PREDICTED = "tangent_predicted"
-    EULER_ZYX = "euler_zyx"
-
-
-class RuleName(StrEnum):
-    """What the calibration counts as one draw: a frame, or a sequence."""
-
-    POOLED = "pooled"
-    HIERARCHICAL = "hierarchical"
-
-
-class SubsetName(StrEnum):
-    """The frames recorded as test, or all of data that the run has not seen."""
-
-    TEST = "test"
-    ALL = "all"
+_DATA, _NETWORK, _TRAINING = "Data", "Network", "Training"
 
 
 DatasetArgument = Annotated[
     str, typer.Argument(help="FORMAT:PATH, e.g. 7scenes:scenes/redkitchen.", show_default=False)
 ]
 
-BackboneOption = Annotated[str, typer.Option(help="Any timm model.")]
+BackboneOption = Annotated[str, typer.Option(help="Any timm model.", rich_help_panel=_NETWORK)]
 WeightsOption = Annotated[
-    str, typer.Option(help="timm (downloads), a safetensors file, or none (random, untrained).")
+    str,
+    typer.Option(
+        help="timm (downloads), a safetensors file, or none (random, untrained).",
+        rich_help_panel=_NETWORK,
+    ),
 ]
 StagesOption = Annotated[
-    str, typer.Option(help="Strides of the stages used, e.g. 16 or 8,16; final: the last layer.")
+    str,
+    typer.Option(
+        help="Strides of the stages used, e.g. 16 or 8,16; final: the last layer.",
+        rich_help_panel=_NETWORK,
+    ),
 ]
 GridOption = Annotated[
-    str, typer.Option(help="Rows x columns each stage is averaged to; 1x1: global mean.")
+    str,
+    typer.Option(
+        help="Rows x columns that each stage is averaged to; 1x1: global mean.",
+        rich_help_panel=_NETWORK,
+    ),
 ]
 CopiesOption = Annotated[
-    int | None, typer.Option(min=0, help="Augmented copies of each training frame.")
+    int | None,
+    typer.Option(
+        min=0, help="Augmented copies of each training frame; default: 48.", rich_help_panel=_DATA
+    ),
 ]
-StepsOption = Annotated[int | None, typer.Option(min=100, help="Steps of training the head.")]
+StepsOption = Annotated[
+    int | None,
+    typer.Option(
+        min=100, help="Training steps of the head; default: 10000.", rich_help_panel=_TRAINING
+    ),
+]
+TrainingSplitOption = Annotated[
+    SplitKind | None,
+    typer.Option(
+        help="Unit of the split; default: sequence if there are at least five, else block.",
+        rich_help_panel=_DATA,
+    ),
+]
 
 
 def _open(dataset: str) -> PoseDataset:
-    """Open a data set and say on stderr what was read, and what was left out and why."""
+    """Open a data set; print on stderr what was read, and what was skipped and why."""
     from cvo_export.datasets import open_dataset
     from cvo_export.datasets.describe import summary
 
@@ -230,232 +92,199 @@ def _open(dataset: str) -> PoseDataset:
     return opened
 
 
-@app.command()
-def train(
-    method: Annotated[
-        MethodName,
-        typer.Argument(
-            help="Conformal method (cjp, cqr, csp, mcqr); the others are baselines.",
-            show_default=False,
-        ),
-    ],
+def _train(
+    method: str,
     dataset: DatasetArgument,
     run_dir: Annotated[
         Path,
-        typer.Argument(help="New folder; or one to go on with, same options.", show_default=False),
+        typer.Argument(
+            help="New folder, or the folder of an interrupted run with the same options.",
+            show_default=False,
+        ),
     ],
+    *,
+    split: TrainingSplitOption = None,
+    copies: CopiesOption = None,
+    rotation_deg: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            help="Camera rotation of the copies, deviation per axis; default: 6.",
+            rich_help_panel=_DATA,
+        ),
+    ] = None,
+    light: Annotated[
+        float | None,
+        typer.Option(
+            min=0, help="Changes of light in the copies, 0 to 1; default: 1.", rich_help_panel=_DATA
+        ),
+    ] = None,
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of features shared by several runs; default: in RUN_DIR.",
+            rich_help_panel=_DATA,
+        ),
+    ] = None,
     backbone: BackboneOption = "mobilenetv2_100",
     weights: WeightsOption = "timm",
     stages: StagesOption = "16",
     grid: GridOption = "3x4",
     normalisation: Annotated[
-        NormalisationName | None,
-        typer.Option(help="Pixel scaling; half (x - 127.5)/127.5 for a file, timm for timm's."),
+        Normalisation | None,
+        typer.Option(
+            help="Pixel scaling; default: half, (x - 127.5)/127.5, for a file, else timm's.",
+            rich_help_panel=_NETWORK,
+        ),
     ] = None,
-    size: Annotated[str, typer.Option(help="Width x height of the model's input.")] = "256x192",
-    crop: Annotated[CropName, typer.Option(help="What the model sees.")] = CropName.NONE,
-    split: Annotated[
-        SplitName | None,
-        typer.Option(help="sequence where there are five or more, else block."),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Decides split, training and noise.")] = 0,
-    copies: CopiesOption = None,
-    rotation_deg: Annotated[
-        float | None, typer.Option(min=0, help="Camera turns of the copies, deviation per axis.")
-    ] = None,
-    light: Annotated[
-        float | None, typer.Option(min=0, help="Changes of light of the copies, 0 to 1.")
-    ] = None,
-    fine_tune: Annotated[
-        int | None, typer.Option(min=0, help="Epochs of training the backbone, too; 0: frozen.")
-    ] = None,
+    size: Annotated[
+        str,
+        typer.Option(help="Width x height of the model's input.", rich_help_panel=_NETWORK),
+    ] = "256x192",
+    crop: Annotated[
+        Crop,
+        typer.Option(help="Part of the image that the model sees.", rich_help_panel=_NETWORK),
+    ] = "none",
+    seed: Annotated[
+        int,
+        typer.Option(min=0, help="Of split, training and noise.", rich_help_panel=_TRAINING),
+    ] = 0,
     steps: StepsOption = None,
-    cache: Annotated[
-        Path | None,
-        typer.Option(help="Folder of features that several runs share; else in the run's."),
-    ] = None,
-    latent_size: Annotated[
-        int | None, typer.Option(min=1, help="cjp: dimension of the latent, 16; the paper's is 3.")
-    ] = None,
-    latent: Annotated[
-        LatentName | None, typer.Option(help="cjp: mean by default; the paper's is sample.")
-    ] = None,
-    bounds: Annotated[
-        BoundsName | None, typer.Option(help="cjp: softplus by default; free: sorted outputs.")
-    ] = None,
-    sharpness: Annotated[
-        float | None, typer.Option(min=0, max=1, help="cjp: lambda of the calibration loss, 0.5.")
-    ] = None,
-    point_loss: Annotated[
-        PointLossName | None,
-        typer.Option(help="cjp: absolute by default; squared: the paper's."),
-    ] = None,
-    gate: Annotated[
-        GateName | None, typer.Option(help="cjp: corrected by default; literal: Eq. 5a.")
-    ] = None,
-    interval_form: Annotated[
-        IntervalFormName | None, typer.Option(help="cjp: proper by default; mean: the paper's.")
-    ] = None,
-    kl_weight: Annotated[
-        float | None, typer.Option(min=0, help="beta of the divergence; cjp: 0.001, mcqr: 0.01.")
-    ] = None,
-    members: Annotated[
-        int | None, typer.Option(min=1, max=64, help="cjp: networks whose answers are averaged, 1.")
-    ] = None,
-    quantiles: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="cqr: levels of the bounds before conformalising, 0.05 0.95."),
-    ] = None,
-    trees: Annotated[int | None, typer.Option(min=1, help="cqr: trees of the forest, 100.")] = None,
-    leaf_size: Annotated[
-        int | None, typer.Option(min=1, help="cqr: least rows in a leaf, 10.")
-    ] = None,
-    split_features: Annotated[
-        float | None, typer.Option(help="cqr: share of inputs tried at a split, 0.33.")
-    ] = None,
-    components: Annotated[
+    fine_tune: Annotated[
         int | None,
         typer.Option(
             min=0,
-            help="cqr, mcqr: principal components of the features, 58, 16; mdn: Gaussians, 3.",
+            help="Epochs in which the backbone learns as well; default: 0, frozen.",
+            rich_help_panel=_TRAINING,
         ),
     ] = None,
-    forest: Annotated[
-        ForestName | None, typer.Option(help="cqr: shared by default; per_dof: the paper's.")
-    ] = None,
-    residuals: Annotated[
-        ResidualsName | None,
-        typer.Option(help="cqr, mcqr: cross_fitted below 1500 frames by default, else held_out."),
-    ] = None,
-    forest_copies: Annotated[
-        int | None, typer.Option(min=0, help="cqr: augmented copies among the forest's rows.")
-    ] = None,
-    classes: Annotated[
-        int | None,
-        typer.Option(min=2, max=256, help="csp: K, classes of each degree of freedom, 128."),
-    ] = None,
-    labels: Annotated[
-        LabelsName | None, typer.Option(help="csp: ordinal by default; one_hot: the paper's.")
-    ] = None,
-    label_sigma: Annotated[
-        float | None,
-        typer.Option(min=0.01, help="csp: deviation of the labels in classes; val chooses."),
-    ] = None,
-    augmentation: Annotated[
-        AugmentationName | None,
-        typer.Option(
-            help="mcqr: MC-dropout passes as training data; none by default; predictions: the "
-            "paper's."
-        ),
-    ] = None,
-    passes: Annotated[
-        int | None, typer.Option(min=1, help="mcqr: stochastic passes of each frame, 20.")
-    ] = None,
-    scale: Annotated[
-        ScaleName | None, typer.Option(help="mcqr: local by default; constant: the paper's.")
-    ] = None,
-    kappa: Annotated[
-        float | None, typer.Option(min=0.01, help="mcqr: inflation of the region; val chooses.")
-    ] = None,
-    dropout: Annotated[
-        float | None,
-        typer.Option(
-            min=0, max=0.99, help="mc-dropout: rate, 0.01; mcqr: 0.05 with passes; cjp, csp: 0."
-        ),
-    ] = None,
+    **options: Any,  # noqa: ANN401 - the methods' own
 ) -> None:
-    """Train a method on a data set; interrupted, the same command goes on.
-
-    Options that begin with the name of a method belong to that method.
-    """
+    """Train a method on a data set; repeat the command to resume an interrupted run."""
     from cvo_export.data.splits import default_kind
-    from cvo_export.training.configure import configure
-    from cvo_export.training.loop import train as train_run
+    from cvo_export.training.configure import configure, head_config
+    from cvo_export.training.loop import train
 
+    # Options of another method are refused before any data is opened.
+    head_config(method, options)
     opened = _open(dataset)
     config = configure(
-        method=method.value,
+        method=method,
         dataset=dataset,
-        split=split.value if split else default_kind(opened),
+        split=split or default_kind(opened),
         seed=seed,
         size=size,
-        crop=crop.value,
+        crop=crop,
         backbone=backbone,
         weights=weights,
         stages=stages,
         grid=grid,
-        normalisation=normalisation.value if normalisation else None,
+        normalisation=normalisation,
         copies=copies,
         rotation_deg=rotation_deg,
         light=light,
         fine_tune=fine_tune,
         steps=steps,
-        head={
-            "latent_size": latent_size,
-            "latent": latent,
-            "bounds": bounds,
-            "sharpness": sharpness,
-            "point_loss": point_loss,
-            "gate": gate,
-            "interval_form": interval_form,
-            "kl_weight": kl_weight,
-            "members": members,
-            "quantiles": quantiles,
-            "trees": trees,
-            "leaf_size": leaf_size,
-            "split_features": split_features,
-            "components": components,
-            "forest": forest,
-            "residuals": residuals,
-            "forest_copies": forest_copies,
-            "classes": classes,
-            "labels": labels,
-            "label_sigma": label_sigma,
-            "dropout": dropout,
-            "augmentation": augmentation.value if augmentation else None,
-            "passes": passes,
-            "scale": scale.value if scale else None,
-            "kappa": kappa,
-        },
+        head=options,
     )
     with show_progress() as progress:
-        run = train_run(run_dir, config, progress, cache)
+        run = train(run_dir, config, progress, cache)
     print(*run.lines(), sep="\n", file=sys.stderr)
 
 
+class _TrainCommand(TyperCommand):
+    """Gets its parameters when they are first needed: the methods' options import torch."""
+
+    _built = False
+
+    def get_params(self, ctx: typer.Context) -> list[Any]:  # type: ignore[override]
+        """Return the command's parameters, those of the registered methods included."""
+        if not self._built:
+            self._built = True
+            complete = _with_method_options()
+            self.params, self.callback = complete.params, complete.callback
+        return super().get_params(ctx)
+
+
+def _with_method_options() -> TyperCommand:
+    from cvo_export.networks.methods import TRAINABLE
+    from cvo_export.training.options import method_parameters
+
+    about = typer.Argument(
+        metavar="method", help=f"One of {', '.join(TRAINABLE)}.", show_default=False
+    )
+    chosen: Any = Annotated[Literal[tuple(TRAINABLE)], about]
+    method, *others = signature(_train, eval_str=True).parameters.values()
+    explicit = [other for other in others if other.kind is not Parameter.VAR_KEYWORD]
+
+    def command(**given: Any) -> None:  # noqa: ANN401
+        _train(**given)
+
+    parameters = [method.replace(annotation=chosen), *explicit, *method_parameters(TRAINABLE)]
+    command.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+    alone = typer.Typer(add_completion=False)
+    alone.command()(command)
+    return typer.main.get_command(alone)  # type: ignore[return-value]
+
+
+@app.command(
+    cls=_TrainCommand,
+    epilog=examples(
+        "cvo-export train cjp 7scenes:scenes/redkitchen runs/redkitchen",
+        "cvo-export train cqr synthetic:room runs/room --weights none --trees 50",
+        "cvo-export train csp tum:freiburg1_room runs/room --classes 64 --seed 1",
+    ),
+    help=_train.__doc__,
+)
+def train() -> None:
+    """Be listed; ``_TrainCommand`` has the parameters."""
+
+
 RuleOption = Annotated[
-    RuleName | None,
-    typer.Option(help="hierarchical for a split by sequence, else pooled."),
+    Rule | None,
+    typer.Option(
+        help="What one calibration draw is: a frame (pooled) or a sequence (hierarchical); "
+        "default: hierarchical for a split by sequence, else pooled."
+    ),
 ]
-JointOption = Annotated[JointName, typer.Option(help="How the joint scope is made.")]
+JointOption = Annotated[
+    Joint, typer.Option(help="Score that calibrates all six degrees of freedom together.")
+]
 ScoreOption = Annotated[
     str | None,
-    typer.Option(help="csp: aps, lac, raps; all others: normalised, additive; val decides."),
+    typer.Option(
+        help="csp: aps, lac or raps; other methods: normalised or additive; default: chosen on val."
+    ),
 ]
 SidesOption = Annotated[
-    SidesName | None,
-    typer.Option(help="cqr: which bounds are calibrated; symmetric in a new bundle."),
+    Sides | None,
+    typer.Option(help="cqr: bounds that are calibrated; default in a new bundle: symmetric."),
 ]
-NameOption = Annotated[str | None, typer.Option(help="The folder's name by default.")]
+NameOption = Annotated[str | None, typer.Option(help="Default: the folder's name.")]
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "cvo-export publish runs/redkitchen bundles/redkitchen",
+        "cvo-export publish runs/redkitchen bundles/redkitchen-int8 --precision int8",
+    )
+)
 def publish(
     run_dir: Annotated[Path, typer.Argument(help="A finished run.", show_default=False)],
     bundle: Annotated[Path, typer.Argument(help="Bundle folder to write.", show_default=False)],
     precision: Annotated[
-        PrecisionName, typer.Option(help="int8: an 8-bit backbone, calibrated as such.")
-    ] = PrecisionName.FP32,
+        Precision, typer.Option(help="int8: an 8-bit backbone, with thresholds of its own.")
+    ] = "fp32",
     provider: Annotated[
-        ProviderName, typer.Option(help="The engine that is calibrated, and that it runs on.")
-    ] = ProviderName.ONNXRUNTIME,
+        Provider, typer.Option(help="Engine that the bundle is calibrated for and runs on.")
+    ] = "onnxruntime",
     rule: RuleOption = None,
-    joint: JointOption = JointName.MAX,
+    joint: JointOption = "max",
     score: ScoreOption = None,
     sides: SidesOption = None,
     name: NameOption = None,
     dataset: Annotated[
-        str | None, typer.Option(help="Where the data set is now, if it has moved.")
+        str | None, typer.Option(help="New location of the data set, if it has moved.")
     ] = None,
 ) -> None:
     """Export a run to ONNX, calibrate that graph and write its bundle."""
@@ -467,17 +296,22 @@ def publish(
         load_run(run_dir, dataset),
         bundle,
         name or bundle.resolve().name,
-        rule=rule.value if rule else None,
-        joint=joint.value,
+        rule=rule,
+        joint=joint,
         score=score,
-        sides=sides.value if sides else None,
-        precision=precision.value,
-        provider=provider.value,
+        sides=sides,
+        precision=precision,
+        provider=provider,
     )
     print(*inspect_lines(calibration), sep="\n")
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "cvo-export calibrate my-network.onnx tum:freiburg1_room bundles/room",
+        "cvo-export calibrate bundles/redkitchen 7scenes:scenes/office bundles/office",
+    )
+)
 def calibrate(
     model: Annotated[
         Path, typer.Argument(help="An ONNX file, or a bundle folder.", show_default=False)
@@ -485,35 +319,38 @@ def calibrate(
     dataset: DatasetArgument,
     bundle: Annotated[Path, typer.Argument(help="Bundle folder to write.", show_default=False)],
     split: Annotated[
-        SplitName | None,
-        typer.Option(help="sequence where there are three or more, else block."),
+        SplitKind | None,
+        typer.Option(
+            help="Unit of the split; default: sequence if there are at least three, else block."
+        ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Decides the split; 0.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the split; default: 0.")] = None,
     rule: RuleOption = None,
-    joint: JointOption = JointName.MAX,
+    joint: JointOption = "max",
     score: ScoreOption = None,
     sides: SidesOption = None,
     rotation: Annotated[
-        RotationName | None,
-        typer.Option(help="ONNX file: chart of its bounds; tangent_predicted by default."),
+        GivenRotation | None,
+        typer.Option(help="ONNX file: chart of its bounds; default: tangent_predicted."),
     ] = None,
     crop: Annotated[
-        CropName | None, typer.Option(help="ONNX file: what it sees; none by default.")
+        Crop | None, typer.Option(help="ONNX file: part of the image it sees; default: none.")
     ] = None,
     new_data: Annotated[
         bool,
-        typer.Option("--new-data", help="Bundle: the data are new, though of the same name."),
+        typer.Option("--new-data", help="Bundle: accept data of the same name as new."),
     ] = False,
     provider: Annotated[
-        ProviderName | None,
-        typer.Option(help="The engine that it is to run on; the bundle's own, else onnxruntime."),
+        Provider | None,
+        typer.Option(help="Engine to calibrate for; default: the bundle's own, or onnxruntime."),
     ] = None,
     name: NameOption = None,
 ) -> None:
-    """Calibrate a network that is there, on data that it has not seen: your own, or a bundle's.
+    """Calibrate an existing network, an ONNX file or a bundle's, on data it has not seen.
 
-    An ONNX file has the input image, uint8 [1, height, width, 3], RGB, and the outputs pose [1, 7]
-    and, for intervals that adapt, lower and upper [1, 6].
+    An ONNX file has the input image, uint8 of shape (1, height, width, 3), RGB,
+    and the output pose (1, 7); for intervals that adapt, also the outputs lower
+    and upper (1, 6).
     """
     from cvo_edge.programs.inspect import inspect_lines
     from cvo_export.calibrate import calibrate as calibrate_network
@@ -523,16 +360,16 @@ def calibrate(
         _open(dataset),
         bundle,
         name or bundle.resolve().name,
-        kind=split.value if split else None,
+        kind=split,
         seed=seed,
-        rule=rule.value if rule else None,
-        joint=joint.value,
+        rule=rule,
+        joint=joint,
         score=score,
-        sides=sides.value if sides else None,
-        rotation=rotation.value if rotation else None,
-        crop=crop.value if crop else None,
+        sides=sides,
+        rotation=rotation,
+        crop=crop,
         new_data=new_data,
-        provider=provider.value if provider else None,
+        provider=provider,
     )
     print(*inspect_lines(calibration), sep="\n")
 
@@ -544,30 +381,36 @@ def sign(
     bundle_version: Annotated[
         int | None,
         typer.Option(
-            help="Devices that have run it refuse lower ones; by default the seconds since 1970.",
+            help="Devices refuse versions below one they have run; default: seconds since 1970.",
             show_default=False,
         ),
     ] = None,
 ) -> None:
-    """Sign a bundle, for devices that are told whose to take (run --public-key)."""
+    """Sign a bundle for devices that accept only signed ones (run --public-key)."""
     from cvo_export.sign import sign as sign_bundle
 
     signature = sign_bundle(bundle, key, bundle_version)
     print(f"{signature.name}: version {signature.version}, signed with the key {signature.key}")
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "cvo-export evaluate bundles/redkitchen 7scenes:scenes/redkitchen",
+        "cvo-export evaluate bundles/redkitchen 7scenes:new-flights --subset all",
+        "cvo-export evaluate bundles/room synthetic:room --noise speckle:0.3",
+    )
+)
 def evaluate(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
     dataset: DatasetArgument,
     subset: Annotated[
-        SubsetName, typer.Option(help="The run's test frames, or all of unseen data.")
-    ] = SubsetName.TEST,
+        Subset, typer.Option(help="The run's test frames, or all frames of unseen data.")
+    ] = "test",
     noise: Annotated[
         str | None,
         typer.Option(
             metavar="NAME[:STRENGTH]",
-            help="Degrade the frames, e.g. speckle:0.3; thresholds as they are, and recalibrated.",
+            help="Degrade the frames, e.g. speckle:0.3.",
         ),
     ] = None,
     json_file: Annotated[
@@ -575,22 +418,22 @@ def evaluate(
     ] = None,
     min_coverage: Annotated[
         float | None,
-        typer.Option(min=0, max=1, help="Exit 8 where a DoF covers less at 0.9 marginal."),
+        typer.Option(min=0, max=1, help="Exit 8 if any DoF covers less at 0.9 marginal."),
     ] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of one inference.")] = None,
 ) -> None:
-    """Coverage, width and error of a bundle on held-out frames.
+    """Measure coverage, width and error of a bundle on held-out frames.
 
-    With --noise of degraded test frames: at the bundle's own thresholds, and at those of the run's
-    calibration frames degraded alike. NAME is gaussian, salt-and-pepper, speckle, motion-blur,
-    exposure or occlusion.
+    With --noise, the frames are degraded; results are given for the bundle's own
+    thresholds and for thresholds of calibration frames with the same noise. NAME
+    is gaussian, salt-and-pepper, speckle, motion-blur, exposure or occlusion.
     """
     from cvo_export.data.noise import parse_noise
     from cvo_export.evaluate import check_coverage, table
     from cvo_export.evaluate import evaluate as evaluate_bundle
 
     parsed = None if noise is None else parse_noise(noise)
-    report = evaluate_bundle(bundle, _open(dataset), subset.value, threads, parsed)
+    report = evaluate_bundle(bundle, _open(dataset), subset, threads, parsed)
     if json_file is not None:
         write_text(json_file, json.dumps(report, indent=1) + "\n")
     if json_file != "-":
@@ -602,15 +445,12 @@ def evaluate(
 @app.command()
 def compare(
     dataset: DatasetArgument,
-    out: Annotated[Path, typer.Argument(help="Folder of the comparison; or one to go on with.")],
+    out: Annotated[Path, typer.Argument(help="New folder, or that of an interrupted comparison.")],
     methods: Annotated[
-        str | None, typer.Option(help="Names with commas; all methods and baselines by default.")
+        str | None, typer.Option(help="Names with commas; default: all methods and baselines.")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="How many, from 0 on.")] = 3,
-    split: Annotated[
-        SplitName | None,
-        typer.Option(help="sequence where there are five or more, else block."),
-    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0.")] = 3,
+    split: TrainingSplitOption = None,
     backbone: BackboneOption = "mobilenetv2_100",
     weights: WeightsOption = "timm",
     stages: StagesOption = "16",
@@ -618,15 +458,13 @@ def compare(
     steps: StepsOption = None,
     copies: CopiesOption = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at a time; all allowed cores by default.")
+        int | None, typer.Option(min=1, help="Concurrent runs; default: one a core.")
     ] = None,
-    cache: Annotated[
-        Path | None, typer.Option(help="Folder of features; by default in OUT.")
-    ] = None,
+    cache: Annotated[Path | None, typer.Option(help="Folder of features; default: in OUT.")] = None,
 ) -> None:
     """Train, publish and evaluate methods and baselines over seeds, and time their frames.
 
-    Interrupted, the same command goes on. OUT gets compare.json and the table compare.txt.
+    Repeat the command to resume. OUT gets compare.json and the table compare.txt.
     """
     from cvo_export.networks.methods import TRAINABLE
     from cvo_export.study.compare import compare as compare_methods
@@ -634,7 +472,7 @@ def compare(
     _open(dataset)
     options = {
         "dataset": dataset,
-        "split": split.value if split else None,
+        "split": split,
         "size": "256x192",
         "crop": "none",
         "backbone": backbone,
@@ -662,20 +500,18 @@ def compare(
 @app.command()
 def study(
     config: Annotated[Path, typer.Argument(help="Grids to run, TOML.", show_default=False)],
-    out: Annotated[Path, typer.Argument(help="Folder of the study; or one to go on with.")],
+    out: Annotated[Path, typer.Argument(help="New folder, or that of an interrupted study.")],
     engine: Annotated[
-        EngineName, typer.Option(help="Processes of this machine, or a Ray cluster.")
-    ] = EngineName.LOCAL,
+        StudyEngine, typer.Option(help="Processes of this machine, or a Ray cluster.")
+    ] = "local",
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="local: runs at a time; all allowed cores by default.")
+        int | None, typer.Option(min=1, help="Engine local: concurrent runs; default: one a core.")
     ] = None,
-    cache: Annotated[
-        Path | None, typer.Option(help="Folder of features; by default in OUT.")
-    ] = None,
+    cache: Annotated[Path | None, typer.Option(help="Folder of features; default: in OUT.")] = None,
 ) -> None:
     """Run grids of methods, backbones, data, noise, options and seeds, and report on them.
 
-    Interrupted, the same command goes on. OUT gets results.json, report.html and pictures.
+    Repeat the command to resume. OUT gets results.json, report.html and pictures.
     """
     from cvo_edge.cores import allowed_cores
     from cvo_export.study.cells import CellFolder
@@ -684,13 +520,13 @@ def study(
     from cvo_export.study.report import page_template, write_report
     from cvo_export.study.workers import run_tasks
 
-    if engine is EngineName.RAY and jobs is not None:
-        raise UsageError("jobs: expected with the engine local alone, found it with ray")
-    # Hours later would be late to learn that a page cannot be written.
+    if engine == "ray" and jobs is not None:
+        raise UsageError("--jobs: expected only with the engine local, found the engine ray")
+    # Fail now rather than after hours if the page cannot be written.
     template = page_template()
     grids = read_study(config)
     local = nullcontext(partial(run_tasks, jobs or allowed_cores()))
-    with local if engine is EngineName.LOCAL else ray_engine() as run, show_progress() as progress:
+    with local if engine == "local" else ray_engine() as run, show_progress() as progress:
         folder = CellFolder(out.resolve(), (cache or out / "features").resolve())
         say = partial(print, file=sys.stderr, flush=True)
         results = run_study(grids, folder, run, progress, say)
@@ -703,25 +539,26 @@ def plot(
     dataset: DatasetArgument,
     out: Annotated[Path, typer.Option(help="Picture to write, e.g. bands.png.")],
     subset: Annotated[
-        SubsetName, typer.Option(help="The run's test frames, or all of unseen data.")
-    ] = SubsetName.TEST,
+        Subset, typer.Option(help="The run's test frames, or all frames of unseen data.")
+    ] = "test",
     sequence: Annotated[str | None, typer.Option(help="Only this sequence.")] = None,
-    confidence: Annotated[float, typer.Option(help="One of those stored in the bundle.")] = 0.9,
+    confidence: Annotated[float, typer.Option(help="A confidence stored in the bundle.")] = 0.9,
     scope: Annotated[
-        ScopeName, typer.Option(help="Each degree of freedom, or all six at once.")
-    ] = ScopeName.MARGINAL,
+        Scope,
+        typer.Option(help="Whether it holds for each degree of freedom or for all six at once."),
+    ] = "marginal",
 ) -> None:
-    """Draw truth, point and bands of each degree of freedom, and x against y."""
+    """Plot truth, point and bands of each degree of freedom, and x against y."""
     from cvo_export.plot import plot as draw
 
     draw(
         bundle,
         _open(dataset),
         out,
-        subset=subset.value,
+        subset=subset,
         sequence=sequence,
         confidence=confidence,
-        scope=scope.value,
+        scope=scope,
     )
     print(out)
 
@@ -731,7 +568,9 @@ def render(
     dataset: DatasetArgument,
     folder: Annotated[Path, typer.Argument(help="New folder.", show_default=False)],
     sequence: Annotated[str, typer.Option(help="Name of one sequence.")],
-    frames: Annotated[int | None, typer.Option(min=1, help="Only the first so many.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Only the first frames, this many.")
+    ] = None,
 ) -> None:
     """Write one sequence as a 7-Scenes folder: JPEG images and .pose.txt."""
     from cvo_export.datasets.seven_scenes import write_sequence
@@ -748,11 +587,29 @@ def render(
 
 @app.command()
 def dataset(dataset: DatasetArgument) -> None:
-    """Say what a reader finds: frames, skipped ones and why, sequences, camera, extent."""
+    """Describe a data set: frames, skipped frames and why, sequences, camera, extent."""
     from cvo_export.datasets import open_dataset
     from cvo_export.datasets.describe import describe
 
     print(*describe(open_dataset(dataset)), sep="\n")
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"cvo-export {version('cvo-export')} (cvo-edge {version('cvo-edge')})")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the versions."),
+    ] = False,
+) -> None:
+    """Options that need no command."""
 
 
 def main() -> NoReturn:

@@ -5,25 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration, Rule
+from cvo_edge.bundle.format import Calibration
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import GateError, UsageError
 from cvo_edge.heads import HEADS
 from cvo_edge.odometer import Odometer
+from cvo_edge.vocabulary import Rule
 from cvo_export.bundles.figures import Claim, Sets, point_error
 from cvo_export.bundles.thresholds import observe, with_thresholds
 from cvo_export.data.noise import Noise, noisy
 from cvo_export.data.splits import Split, same_split
 from cvo_export.datasets import PoseDataset
+from cvo_export.vocabulary import Subset
 
 Array = NDArray[np.float64]
-Subset = Literal["test", "all"]
 
 
 # What the table says of the claims that are not exact.

@@ -14,9 +14,10 @@ from cvo_edge.estimate import PoseInterval
 from cvo_edge.input.frame import Frame
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import Chart
-from cvo_edge.sets import Scope
+from cvo_edge.vocabulary import Scope
 from cvo_export.datasets import PoseDataset
-from cvo_export.evaluate import Subset, subset_indices
+from cvo_export.evaluate import subset_indices
+from cvo_export.vocabulary import Subset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

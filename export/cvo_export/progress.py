@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar for a terminal, a line now and then for a log."""
+"""Progress of training on stderr: bars on a terminal, a line every 15 seconds in a log."""
 
 from __future__ import annotations
 
@@ -6,16 +6,24 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Literal, Protocol
 
-# What is done, how much of it, of how much.
-Progress = Callable[[str, int, int], None]
+Stage = Literal["features", "training", "fine-tuning"]
+
+
+class Progress(Protocol):
+    """Called by training as it advances."""
+
+    def __call__(self, stage: Stage, done: int, total: int, note: str = "", /) -> None:
+        """Report that ``done`` of ``total`` steps of a stage are finished; ``note`` is shown."""
+
 
 _SECONDS_BETWEEN_LINES = 15.0
 
 
 @contextmanager
 def show_progress() -> Iterator[Progress]:
-    """Yield ``progress(what, done, total)``."""
+    """Yield the ``Progress`` that a user sees."""
     if sys.stderr.isatty():
         with _bar() as progress:
             yield progress
@@ -27,28 +35,39 @@ def show_progress() -> Iterator[Progress]:
 def _bar() -> Iterator[Progress]:
     from rich.console import Console
     from rich.progress import Progress as RichProgress
+    from rich.progress import TaskID
 
     with RichProgress(console=Console(stderr=True)) as bars:
-        tasks: dict[str, int] = {}
+        tasks: dict[Stage, TaskID] = {}
+        last: dict[Stage, int] = {}
 
-        def progress(what: str, done: int, total: int) -> None:
-            # "training, val score 0.3" goes on with the bar of "training".
-            stage = what.split(",")[0]
+        def progress(stage: Stage, done: int, total: int, note: str = "") -> None:
             if stage not in tasks:
-                tasks[stage] = int(bars.add_task(stage, total=total))
-            bars.update(bars.task_ids[tasks[stage]], completed=done, description=what)
+                tasks[stage] = bars.add_task(stage, total=total)
+            elif done < last[stage]:
+                # The next lesson, or the next set of features, begins.
+                bars.reset(tasks[stage])
+            last[stage] = done
+            text = _text(stage, note)
+            bars.update(tasks[stage], completed=done, total=total, description=text)
 
         yield progress
 
 
-def _lines() -> Progress:
-    start = time.monotonic()
-    last = {"": -_SECONDS_BETWEEN_LINES}
+def _lines(clock: Callable[[], float] = time.monotonic) -> Progress:
+    start = clock()
+    last = -_SECONDS_BETWEEN_LINES
 
-    def progress(what: str, done: int, total: int) -> None:
-        now = time.monotonic() - start
-        if done == total or now - last[""] >= _SECONDS_BETWEEN_LINES:
-            last[""] = now
-            print(f"{now:7.1f} s  {what}: {done} of {total}", file=sys.stderr, flush=True)
+    def progress(stage: Stage, done: int, total: int, note: str = "") -> None:
+        nonlocal last
+        now = clock() - start
+        if done == total or now - last >= _SECONDS_BETWEEN_LINES:
+            last = now
+            text = f"{now:7.1f} s  {_text(stage, note)}: {done} of {total}"
+            print(text, file=sys.stderr, flush=True)
 
     return progress
+
+
+def _text(stage: Stage, note: str) -> str:
+    return f"{stage}, {note}" if note else stage

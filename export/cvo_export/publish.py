@@ -10,20 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import (
-    Calibration,
-    Joint,
-    PoseSpec,
-    Precision,
-    PreprocessSpec,
-    Provenance,
-    Provider,
-    Rule,
-)
+from cvo_edge.bundle.format import Calibration, PoseSpec, PreprocessSpec, Provenance
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
-from cvo_edge.heads.cqr import Sides
 from cvo_edge.input import preprocess
+from cvo_edge.vocabulary import Joint, Precision, Provider, Rule, Sides
 from cvo_export.bundles.draft import (
     CAMERA_FRAME,
     WORLD_FRAME,

@@ -253,10 +253,87 @@ def test_exit_2_for_what_cannot_be_asked(bundle_dir, clip_dir):
     assert "0.5, 0.8, 0.9, 0.95, 0.99" in refused(
         cvo_edge("run", bundle_dir, clip_dir, "--confidence", 0.42), 2
     )
+    assert "nearest: 0.9 and 0.95" in refused(
+        cvo_edge("run", bundle_dir, clip_dir, "--confidence", 0.93), 2
+    )
     assert "--fps" in refused(cvo_edge("run", bundle_dir, clip_dir, "--format", "tum"), 2)
     refused(cvo_edge("run", bundle_dir, clip_dir, "--scope", "both"), 2)
     refused(cvo_edge("run", bundle_dir), 2)
     refused(cvo_edge("walk"), 2)
+
+
+@pytest.mark.parametrize(
+    ("option", "choices"),
+    [
+        ("--scope", "'marginal', 'joint'"),
+        ("--mode", "'live', 'latency', 'throughput'"),
+        ("--format", "'jsonl', 'csv', 'tum', 'table'"),
+    ],
+)
+def test_a_word_that_is_no_choice_is_refused_with_the_choices(bundle_dir, option, choices):
+    assert choices in refused(cvo_edge("run", bundle_dir, "unused", option, "x"), 2)
+
+
+COMMANDS = [
+    (),
+    ("run",),
+    ("bench",),
+    ("verify",),
+    ("inspect",),
+    ("schema",),
+    ("doctor",),
+    ("cache",),
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_help_page_fits_80_columns(command):
+    env = {**os.environ, "COLUMNS": "80", "PYTHONIOENCODING": "utf-8"}
+    shown = cvo_edge(*command, "--help", env=env)
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert max(len(line) for line in shown.stdout.splitlines()) <= 80
+    if command in (("run",), ("bench",)):
+        assert f"cvo-edge {command[0]} " in shown.stdout[shown.stdout.index("Examples:") :]
+
+
+def test_a_reader_that_leaves_a_help_page_ends_it_quietly():
+    receiver, sender = os.pipe()
+    os.close(receiver)
+    done = subprocess.run(
+        [*CVO_EDGE, "run", "--help"], stdout=sender, stderr=subprocess.PIPE, check=False
+    )
+    os.close(sender)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_the_shell_completes_commands_options_and_choices(tmp_path):
+    def completed(words):
+        env = {
+            **os.environ,
+            "_CVO_EDGE_COMPLETE": "complete_bash",
+            "COMP_WORDS": words,
+            "COMP_CWORD": str(len(words.split(" ")) - 1),
+        }
+        return cvo_edge(env=env).stdout.split()
+
+    assert completed("cvo-edge ver") == ["verify"]
+    assert completed("cvo-edge run --sco") == ["--scope"]
+    assert completed("cvo-edge run --scope ") == ["marginal", "joint"]
+    home = {
+        **os.environ,
+        "HOME": str(tmp_path),
+        "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1",
+    }
+    assert cvo_edge("--install-completion", "bash", env=home).returncode == 0
+    assert "_CVO_EDGE_COMPLETE" in (tmp_path / ".bash_completions" / "cvo-edge.sh").read_text()
+
+
+@pytest.mark.parametrize("method", ["cjp", "cqr", "csp", "mcqr"])
+def test_inspect_fits_80_columns(bundle_dir, method):
+    shown = cvo_edge("inspect", bundle_dir.with_name(f"synthetic-room-{method}")).stdout
+    lines = shown.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert any(line.startswith("0.9 joint") for line in lines)
 
 
 def test_exit_3_4_5_for_a_broken_bundle(copied_bundle, clip_dir):

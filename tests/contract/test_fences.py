@@ -40,8 +40,21 @@ def test_importing_the_package_needs_no_command_line():
     assert {"typer", "rich", "click"}.isdisjoint(name.split(".")[0] for name in found)
 
 
+def test_a_plain_start_imports_neither_numpy_nor_what_only_help_needs():
+    code = (
+        "import sys; sys.argv = ['cvo-edge', '--version']\n"
+        "from cvo_edge.__main__ import main\n"
+        "try: main()\nexcept SystemExit: print(*sys.modules, sep='\\n')"
+    )
+    found = fresh_process(code).stdout.splitlines()
+    assert found[0].startswith("cvo-edge ")
+    assert {"rich", "numpy", "cv2"}.isdisjoint(name.split(".")[0] for name in found)
+
+
 def test_the_public_names_are_sorted_and_exist():
     assert cvo_edge.__all__ == sorted(cvo_edge.__all__)
+    assert set(cvo_edge.__all__) <= set(dir(cvo_edge))
+    assert "import_module" not in dir(cvo_edge)
     assert all(hasattr(cvo_edge, name) for name in cvo_edge.__all__)
 
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cvo_edge import Odometer, Reason, Status, UsageError, open_source
+from cvo_edge import Odometer, Reason, Status, UsageError, open_source, read_bundle
 from cvo_edge.ground_truth import open_ground_truth
 
 
@@ -78,11 +78,6 @@ def test_a_bad_image_costs_that_frame_only(bundle_dir, frames, bad):
     assert not broken.bounded
     reason = Reason.IMAGE_UNREADABLE if bad is None else Reason.IMAGE_UNSUPPORTED
     assert broken.reasons == (reason,)
-
-
-def test_a_confidence_that_is_not_stored_is_refused_with_those_that_are(bundle_dir):
-    with pytest.raises(UsageError, match=r"0\.5, 0\.8, 0\.9, 0\.95, 0\.99.*found 0\.91"):
-        Odometer.load(bundle_dir, confidence=0.91)
 
 
 @pytest.mark.parametrize("threads", [0, -1, 100_000])
@@ -170,3 +165,43 @@ def test_a_forked_process_loads_its_own(bundle_dir, clip_dir, what, code):
     )
     assert done.returncode == code, done.stderr
     assert ("found one forked from it" in done.stdout) == (what == "step")
+
+
+def test_a_path_is_no_stream(bundle_dir, clip_dir):
+    with Odometer.load(bundle_dir) as odometer:
+        for path in (clip_dir, str(clip_dir)):
+            with pytest.raises(UsageError, match=r"use odometer\.stream\(open_source\(path\)\)"):
+                next(odometer.stream(path))
+
+
+def test_a_confidence_of_single_precision_is_the_stored_one(bundle_dir):
+    with Odometer.load(str(bundle_dir), confidence=np.float32(0.9)) as odometer:
+        assert odometer.confidence == 0.9
+        assert type(odometer.confidence) is float
+
+
+@pytest.mark.parametrize(
+    ("confidence", "scope", "match"),
+    [
+        (0.925, "marginal", "0.925 is not stored .* nearest: 0.9 and 0.95; stored: 0.5, 0.8"),
+        (0.1, "joint", "nearest: 0.5; stored"),
+        (0.999, "joint", "nearest: 0.99; stored"),
+        (float("nan"), "joint", "nearest: none; stored"),
+        ("high", "joint", "confidence: expected a number, found 'high'"),
+        (0.42, "Joint", "scope: expected one of marginal, joint, found 'Joint'"),
+    ],
+)
+def test_a_threshold_that_is_not_stored_is_refused(bundle_dir, confidence, scope, match):
+    with pytest.raises(UsageError, match=match):
+        Odometer.load(bundle_dir, confidence=confidence, scope=scope)
+
+
+def test_what_is_shown_of_bundle_and_odometer_is_short(bundle_dir):
+    bundle = read_bundle(str(bundle_dir))
+    assert repr(bundle).startswith(f"<Bundle {bundle.calibration.name!r}: ")
+    odometer = Odometer(bundle)
+    assert f"{bundle.calibration.name!r}" in repr(odometer)
+    assert "0.9 marginal, latency mode>" in repr(odometer)
+    odometer.close()
+    assert "closed" in repr(odometer)
+    assert max(len(repr(bundle)), len(repr(odometer))) < 100

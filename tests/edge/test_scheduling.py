@@ -13,7 +13,8 @@ import pytest
 
 from cvo_edge import Frame, Odometer, Reason, SourceError, UsageError, open_source
 from cvo_edge.input.capture import READER
-from cvo_edge.scheduling import MODES, Newest, Played, in_order, plan
+from cvo_edge.scheduling import Newest, Played, in_order, plan
+from cvo_edge.vocabulary import MODES
 
 
 def test_each_mode_uses_as_many_threads_as_it_is_given():

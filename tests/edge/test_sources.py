@@ -38,6 +38,7 @@ def test_folder_is_in_natural_order(tmp_path):
         write(tmp_path / name)
     (tmp_path / "notes.txt").write_text("no image")
     assert names(open_source(str(tmp_path))) == ["frame-9.png", "frame-10.png", "frame-100.png"]
+    assert names(open_source(tmp_path)) == names(open_source(str(tmp_path)))
 
 
 def test_names_of_any_bytes_and_odd_digits_are_read(tmp_path):
@@ -263,6 +264,14 @@ def test_a_camera_that_is_not_there_is_refused():
         pytest.skip("this machine has 64 cameras")
     with pytest.raises(SourceError, match="63"):
         open_source("63")
+    with pytest.raises(SourceError, match="63"):
+        open_source(63)
+
+
+@pytest.mark.parametrize("source", [1.5, None, b"frames"])
+def test_what_is_neither_path_nor_index_is_refused(source):
+    with pytest.raises(UsageError, match="source: expected a path, an address or a camera index"):
+        open_source(source)
 
 
 def test_a_file_of_any_kind_and_size_costs_its_own_frame(tmp_path):

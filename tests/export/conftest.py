@@ -39,7 +39,7 @@ def tiny_config(**changes: Any) -> TrainConfig:
     return TrainConfig(**{**values, **changes})
 
 
-def ignore_progress(what: str, done: int, total: int) -> None:
+def ignore_progress(stage: str, done: int, total: int, note: str = "") -> None:
     """Nobody watches."""
 
 

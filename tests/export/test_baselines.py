@@ -17,7 +17,6 @@ from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import UsageError
 from cvo_edge.heads import CqrHead
 from cvo_export.bundles.thresholds import observe
-from cvo_export.cli import MethodName
 from cvo_export.evaluate import evaluate, find_level, table
 from cvo_export.networks.backbone import BackboneConfig
 from cvo_export.networks.baselines import BASELINES
@@ -31,6 +30,7 @@ from cvo_export.networks.methods import TRAINABLE
 from cvo_export.networks.standardised import Target
 from cvo_export.publish import publish
 from cvo_export.training.loop import train
+from cvo_export.training.options import method_parameters
 from cvo_export.training.run import load_run
 
 from .conftest import ignore_progress, tiny_config
@@ -90,8 +90,11 @@ def seen(runs):
 # -- every baseline -----------------------------------------------------------------------------
 
 
-def test_names_on_the_command_line_are_those_of_the_registries():
-    assert set(MethodName) == set(TRAINABLE) == set(METHODS) | set(BASELINES)
+def test_every_option_of_a_method_is_one_of_the_command_line():
+    options = {parameter.name for parameter in method_parameters(TRAINABLE)}
+    configs = [method.config for method in TRAINABLE.values()]
+    assert options == {name for config in configs for name in config.__struct_fields__}
+    assert set(TRAINABLE) == set(METHODS) | set(BASELINES)
     assert not set(METHODS) & set(BASELINES)
 
 

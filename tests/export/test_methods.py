@@ -207,7 +207,9 @@ def options(**changes):
 
 
 def test_an_option_of_another_method_is_refused():
-    with pytest.raises(UsageError, match="trees: expected an option of csp"):
+    with pytest.raises(
+        UsageError, match=r"--trees is not an option of csp; its options are --classes, --labels"
+    ):
         configure(**options(method="csp", head={"trees": 5}))
     assert configure(**options(method="cqr", head={"trees": 5, "classes": None})).head.trees == 5
 
@@ -217,7 +219,7 @@ def test_an_option_of_another_method_is_refused():
     [
         ("cqr", {"quantiles": (0.9, 0.1)}, "0 < low < high < 1"),
         ("cqr", {"quantiles": (0.0, 0.9)}, "0 < low < high < 1"),
-        ("cqr", {"trees": 0}, "trees"),
+        ("cqr", {"trees": 0}, "--trees of cqr: expected `int` >= 1, found 0"),
         ("csp", {"classes": 1}, "classes"),
         ("mcqr", {"augmentation": "labels", "dropout": 0.0}, "dropout: expected more than 0"),
         ("mcqr", {"kappa": 0.0}, "kappa"),

@@ -213,7 +213,7 @@ def test_names_of_cells_depend_on_no_place(studied, monkeypatch, tmp_path):
         (CONFIG.replace("$CVO_TEST_DATA", DATASET.split(",")[0] + ",flights=1,frames=20"), "val"),
         (CONFIG.replace("speckle:0.3", "rain"), "expected NAME or NAME:STRENGTH"),
         (CONFIG.replace('["cjp"]', '["abc"]'), "expected one of cjp"),
-        (CONFIG.replace("sharpness = [0.5", "classes = [4"), "expected an option of cjp"),
+        (CONFIG.replace("sharpness = [0.5", "classes = [4"), "--classes is not an option of cjp"),
         (CONFIG.replace("CVO_TEST_DATA", "CVO_UNSET"), "CVO_UNSET to be set"),
         ("grids = [", "expected a study"),
     ],

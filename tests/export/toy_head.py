@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from cvo_edge.bundle.format import SixPositive, Threshold
 from cvo_edge.heads import Head
 from cvo_edge.heads.cqr import infinite_where_null
-from cvo_edge.sets import ConformalSet, Scope
+from cvo_edge.sets import ConformalSet
+from cvo_edge.vocabulary import Scope
 
 
 class ToyParameters(Struct, frozen=True, forbid_unknown_fields=True):

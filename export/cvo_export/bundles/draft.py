@@ -18,16 +18,12 @@ from cvo_edge.bundle.format import (
     MODEL_FILE,
     Calibration,
     CalibrationSpec,
-    Joint,
     ModelSpec,
     PoseLimits,
     PoseSpec,
-    Precision,
     PreprocessSpec,
     Provenance,
-    Provider,
     Quaternion,
-    Rule,
     SelfTest,
     Six,
     SixPositive,
@@ -40,6 +36,7 @@ from cvo_edge.heads import HEADS, Candidate, Head
 from cvo_edge.heads.checked import check_tensors
 from cvo_edge.observer import Observer
 from cvo_edge.pose import Chart
+from cvo_edge.vocabulary import Joint, Precision, Provider, Rule
 
 Array = NDArray[np.float64]
 

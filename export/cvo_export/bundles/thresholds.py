@@ -14,15 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import (
-    CONFIDENCES,
-    Calibration,
-    Joint,
-    PoseSpec,
-    Rule,
-    SixOrUnbounded,
-    Threshold,
-)
+from cvo_edge.bundle.format import CONFIDENCES, Calibration, PoseSpec, SixOrUnbounded, Threshold
 from cvo_edge.conformal import (
     conformal_quantile,
     effective_sample_size,
@@ -31,11 +23,11 @@ from cvo_edge.conformal import (
 )
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.heads import Candidate, Head
-from cvo_edge.heads.cqr import Sides
 from cvo_edge.observer import Observation, Observer
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.selftest import observe_selftest
-from cvo_edge.sets import SCOPES, ConformalSet, Scope
+from cvo_edge.sets import ConformalSet
+from cvo_edge.vocabulary import SCOPES, Joint, Rule, Scope, Sides
 from cvo_export.bundles.draft import SELFTEST_SIZE, Counts, Draft
 from cvo_export.datasets import PoseDataset
 

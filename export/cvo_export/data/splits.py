@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import SplitSpec
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.vocabulary import SplitKind
 from cvo_export.datasets import PoseDataset
 
-Kind = Literal["random", "block", "sequence"]
 Purpose = Literal["training", "calibration"]
 SHARES: dict[Purpose, dict[str, float]] = {
     "training": {"train": 0.4, "fit": 0.1, "val": 0.1, "cal": 0.2, "test": 0.2},
@@ -44,7 +44,7 @@ Indices = NDArray[np.int64]
 class Split:
     """Frame numbers by role, ascending; frames of no role were dropped (gaps)."""
 
-    kind: Kind
+    kind: SplitKind
     seed: int
     purpose: Purpose
     roles: Mapping[str, Indices]
@@ -87,7 +87,9 @@ def read_split_spec(path: Path) -> SplitSpec:
     return msgspec.convert(document, SplitSpec)
 
 
-def make_split(dataset: PoseDataset, kind: Kind, seed: int, purpose: Purpose = "training") -> Split:
+def make_split(
+    dataset: PoseDataset, kind: SplitKind, seed: int, purpose: Purpose = "training"
+) -> Split:
     """Give every frame at most one role.
 
     ``random``: frames, exchangeable by construction but flattering on video; ``block``: 20
@@ -120,7 +122,7 @@ def make_split(dataset: PoseDataset, kind: Kind, seed: int, purpose: Purpose = "
     return Split(kind, seed, purpose, roles)
 
 
-def default_kind(dataset: PoseDataset, purpose: Purpose = "training") -> Kind:
+def default_kind(dataset: PoseDataset, purpose: Purpose = "training") -> SplitKind:
     """Return ``sequence`` where there are enough sequences for the roles, else ``block``."""
     sequences = len(dataset.sequence_names)
     if purpose == "calibration" and dataset.own_test:

@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import timm
@@ -20,8 +20,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from cvo_edge.errors import UsageError
-
-Normalisation = Literal["half", "timm"]
+from cvo_export.vocabulary import Normalisation
 
 FINAL = "final"
 TIMM_WEIGHTS = "timm"

@@ -28,7 +28,7 @@ from cvo_export.data.splits import same_split
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.files import read_json, write_json
-from cvo_export.progress import Progress
+from cvo_export.progress import Progress, Stage
 from cvo_export.publish import publish
 from cvo_export.study.workers import Engine
 from cvo_export.training.loop import prepare_features, train
@@ -222,10 +222,12 @@ class CellFolder:
             untrained = [c for name, c in missing.items() if not self.cell(name).is_file()]
             sets = {_features_of(config): config for config in untrained}
             for number, config in enumerate(sets.values(), 1):
-                where = f", set {number} of {len(sets)}"
+                where = f"set {number} of {len(sets)}"
 
-                def told(what: str, done: int, total: int, where: str = where) -> None:
-                    progress(what + where, done, total)
+                def told(
+                    stage: Stage, done: int, total: int, _: str = "", where: str = where
+                ) -> None:
+                    progress(stage, done, total, where)
 
                 prepare_features(config, self.features, told)
             failures: dict[str, CvoError] = {}
@@ -377,9 +379,9 @@ class _Clock:
         self._begin = (process_time(), perf_counter())
         self._begun = False
 
-    def __call__(self, what: str, done: int, total: int) -> None:
+    def __call__(self, stage: Stage, done: int, total: int, _: str = "") -> None:
         """As ``Progress``."""
-        if not self._begun and what == "features" and done == total:
+        if not self._begun and stage == "features" and done == total:
             self._begin = (process_time(), perf_counter())
             self._begun = True
 

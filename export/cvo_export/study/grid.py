@@ -20,9 +20,10 @@ import msgspec
 from msgspec import Meta, Struct
 
 from cvo_edge.errors import UsageError
+from cvo_edge.vocabulary import SplitKind
 from cvo_export.bundles.draft import versions
 from cvo_export.data.noise import parse_noise
-from cvo_export.data.splits import Kind, default_kind
+from cvo_export.data.splits import default_kind
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.datasets.describe import summary
 from cvo_export.files import write_json
@@ -71,7 +72,7 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
     name: Annotated[str, Meta(min_length=1, max_length=60)]
     data: Annotated[list[str], Meta(min_length=1)]
     methods: Annotated[list[str], Meta(min_length=1)]
-    split: Kind | None = None
+    split: SplitKind | None = None
     backbones: Annotated[list[str], Meta(min_length=1)] = msgspec.field(
         default_factory=lambda: ["mobilenetv2_100"]
     )
@@ -103,7 +104,7 @@ class Place(Struct, frozen=True, forbid_unknown_fields=True):
     grid: str
     cell: str
     data: str
-    split: Kind
+    split: SplitKind
     backbone: str
     method: str
     seed: int
@@ -262,7 +263,7 @@ def _labels(opened: Mapping[str, PoseDataset]) -> dict[str, str]:
 def _config(
     grid: Grid,
     data: str,
-    split: Kind,
+    split: SplitKind,
     backbone: str,
     method: str,
     varied: Mapping[str, Value],

@@ -1,4 +1,4 @@
-"""Options of the command line -> a ``TrainConfig``, with what depends on the data filled in."""
+"""Options of the command line -> a ``TrainConfig``, with the values that depend on the data."""
 
 from __future__ import annotations
 
@@ -9,20 +9,22 @@ from typing import Any, cast
 import msgspec
 
 from cvo_edge.errors import UsageError
-from cvo_edge.input.preprocess import Crop
+from cvo_edge.vocabulary import Crop, SplitKind
 from cvo_export.data.augment import AugmentConfig
-from cvo_export.data.splits import Kind, default_kind
+from cvo_export.data.splits import default_kind
 from cvo_export.datasets import open_dataset
-from cvo_export.networks.backbone import NO_WEIGHTS, TIMM_WEIGHTS, BackboneConfig, Normalisation
+from cvo_export.networks.backbone import NO_WEIGHTS, TIMM_WEIGHTS, BackboneConfig
 from cvo_export.networks.methods import TRAINABLE, TrainableConfig
+from cvo_export.training.options import option_name
 from cvo_export.training.run import TrainConfig
+from cvo_export.vocabulary import Normalisation
 
 
 def configure(
     *,
     method: str,
     dataset: str,
-    split: Kind | None,
+    split: SplitKind | None,
     seed: int,
     size: str,
     crop: Crop,
@@ -36,9 +38,10 @@ def configure(
 ) -> TrainConfig:
     """Fill in the defaults; ``given`` are TrainConfig's numbers, ``head`` the method's options.
 
-    None stands for the default of each. Raises UsageError for texts that are not of their form, and
-    for an option that belongs to another method.
+    None stands for the default of each. Raises UsageError for a text of another form and for an
+    option that the method does not have; the data set is opened only after all of these checks.
     """
+    chosen = head_config(method, head)
     width, height = _pair(size, "size", "WIDTHxHEIGHT")
     if min(width, height) < 32 or max(width, height) > 4096:
         raise UsageError(f"size: expected 32 to 4096 pixels, found {size}")
@@ -59,29 +62,42 @@ def configure(
         ),
         weights=weights,
         augment=AugmentConfig(**augment),
-        head=_head_config(method, head),
+        head=chosen,
         **numbers,
     )
 
 
-def _head_config(method: str, options: dict[str, Any]) -> TrainableConfig:
+def head_config(method: str, options: dict[str, Any]) -> TrainableConfig:
+    """Return a method's options, checked; None stands for the default of each.
+
+    Raises UsageError for an unknown method, an option that the method does not have, and a value
+    out of its range.
+    """
     if method not in TRAINABLE:
         raise UsageError(f"method: expected one of {', '.join(TRAINABLE)}, found {method}")
     kind = TRAINABLE[method].config
     given = {name: value for name, value in options.items() if value is not None}
     for name, value in given.items():
-        shown = name.replace("_", "-")
         if name not in kind.__struct_fields__:
+            known = ", ".join(option_name(field) for field in kind.__struct_fields__)
             raise UsageError(
-                f"{shown}: expected an option of {method} "
-                f"({', '.join(kind.__struct_fields__).replace('_', '-')}), found none of it"
+                f"{option_name(name)} is not an option of {method}; its options are {known}"
             )
         if isinstance(value, float) and not math.isfinite(value):
-            raise UsageError(f"{shown}: expected a finite number, found {value}")
+            raise UsageError(f"{option_name(name)}: expected a finite number, found {value}")
     try:
         return cast("TrainableConfig", msgspec.convert({"method": method, **given}, kind))
     except msgspec.ValidationError as error:
-        raise UsageError(str(error)) from None
+        raise UsageError(_refusal(str(error), method, given)) from None
+
+
+def _refusal(problem: str, method: str, given: dict[str, Any]) -> str:
+    """Name the option, and what was given, in the message of a field that is out of range."""
+    found = re.fullmatch(r"E(.*) - at `\$\.(\w+)(?:\[\d+\])?`", problem)
+    if found is None:
+        return problem
+    name = found[2]
+    return f"{option_name(name)} of {method}: e{found[1]}, found {given[name]}"
 
 
 def _pair(text: str, what: str, form: str) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from cvo_edge.cores import allowed_cores
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import SinkError, SourceError
 from cvo_edge.input import preprocess
+from cvo_edge.vocabulary import Crop
 from cvo_export.data.augment import AugmentConfig, augmented, model_intrinsics
 from cvo_export.datasets import PoseDataset
 from cvo_export.graph.to_onnx import export_onnx
@@ -41,7 +42,7 @@ class ModelImages:
         indices: NDArray[np.int64],
         height: int,
         width: int,
-        crop: preprocess.Crop,
+        crop: Crop,
     ) -> None:
         self.poses = dataset.poses[indices]
         self.images = np.empty((indices.size, height, width, 3), dtype=np.uint8)

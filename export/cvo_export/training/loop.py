@@ -34,7 +34,7 @@ from cvo_export.networks.heads import Setting
 from cvo_export.networks.heads.base import Examples, L, Learner
 from cvo_export.networks.methods import TRAINABLE
 from cvo_export.networks.standardised import Target, fit_target
-from cvo_export.progress import Progress
+from cvo_export.progress import Progress, Stage
 from cvo_export.training.features import (
     FeatureExtractor,
     ModelImages,
@@ -217,6 +217,7 @@ class _Trainer:
         build: Callable[[], L],
         rows: Indices | None = None,
         examples: Examples | None = None,
+        candidate: bool = True,
     ) -> L:
         """Train what ``build`` makes, with random numbers of its own name."""
         if self.fine_tuned and self.history and examples is None:
@@ -225,7 +226,7 @@ class _Trainer:
         learner = build()
         if rows is None:
             rows = np.arange(self.n_images if examples is None else examples.x.shape[1])
-        lesson = _Lesson(self._material, name, learner, rows, examples)
+        lesson = _Lesson(self._material, name, learner, rows, examples, candidate)
         self.history += lesson.fit()
         return learner
 
@@ -257,6 +258,7 @@ class _Lesson:
         learner: Learner,
         rows: Indices,
         examples: Examples | None,
+        candidate: bool,
     ) -> None:
         self.material = material
         self.config = material.config
@@ -264,6 +266,7 @@ class _Lesson:
         self.learner = learner
         self.rows = rows
         self._examples = examples
+        self._candidate = candidate
         self.both = nn.ModuleDict({"backbone": material.backbone, "learner": learner})
         self.history: list[History] = []
         self._seed = _lesson_seed(self.config.seed, name)
@@ -301,7 +304,7 @@ class _Lesson:
         groups = [{"params": list(self.learner.parameters()), "peak": self.config.learning_rate}]
         with _one_thread():
             val = examples.val_x, examples.val_y
-            self._loop(phase, self.name, groups, self.config.steps, batch, lambda _: val, state)
+            self._loop(phase, "training", groups, self.config.steps, batch, lambda _: val, state)
 
     def _fit_all(self, phase: int, state: dict[str, Any] | None) -> None:
         """Train backbone and head together on fresh augmented images."""
@@ -342,7 +345,7 @@ class _Lesson:
     def _loop(
         self,
         phase: int,
-        what: str,
+        stage: Stage,
         groups: list[dict[str, Any]],
         steps: int,
         batch: Batch,
@@ -385,10 +388,14 @@ class _Lesson:
                     best = {"score": score, "weights": _cloned(module), "count": 0}
                 else:
                     best["count"] += 1
-                self.history.append(History(self.name, phase, step + 1, value.item(), float(score)))
+                self.history.append(
+                    History(self.name, phase, step + 1, value.item(), float(score), self._candidate)
+                )
                 ended = step + 1 == steps or best["count"] >= _PATIENCE
                 self._write_checkpoint(phase, step + 1, ended, optimiser, averaged, best)
-                self.material.progress(f"{what}, val score {score:.3f}", step + 1, steps)
+                self.material.progress(
+                    stage, step + 1, steps, f"{self.name}, val score {score:.3f}"
+                )
         self._keep(phase, best)
 
     def _learning(self, phase: int) -> nn.ModuleDict:
@@ -433,13 +440,13 @@ class _Lesson:
             self.both.load_state_dict(state["weights"])
             self._learning(state["phase"]).load_state_dict(state["best"]["weights"])
             self.both.load_state_dict(state["weights"])
-        # What torch raises for another network's file, or one that is none.
-        except (RuntimeError, KeyError, UnpicklingError, EOFError):
+            self.history = [History(*entry) for entry in state["history"]]
+        # What torch raises for another network's file, and History for another release's entries.
+        except (RuntimeError, KeyError, TypeError, UnpicklingError, EOFError):
             raise UsageError(
                 f"{self._path}: expected a checkpoint of this version, found another file; remove "
                 "it to train anew"
             ) from None
-        self.history = [History(*entry) for entry in state["history"]]
         return state
 
 

@@ -12,9 +12,9 @@ from msgspec import Meta
 from torch import Tensor, nn
 
 from cvo_edge.errors import SinkError, UsageError
-from cvo_edge.input.preprocess import Crop
+from cvo_edge.vocabulary import Crop, SplitKind
 from cvo_export.data.augment import AugmentConfig
-from cvo_export.data.splits import Kind, Split, make_split, read_split_spec, same_split
+from cvo_export.data.splits import Split, make_split, read_split_spec, same_split
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.networks.backbone import Backbone, BackboneConfig
 from cvo_export.networks.heads import ExportedHead, Setting
@@ -56,7 +56,7 @@ class TrainConfig:
     """
 
     dataset: str
-    split: Kind
+    split: SplitKind
     head: TrainableConfig
     seed: int = 0
     height: int = 192
@@ -83,13 +83,18 @@ class TrainConfig:
 
 
 class History(NamedTuple):
-    """One evaluation on val."""
+    """One evaluation on val.
+
+    ``candidate`` tells whether val may choose the network, as it may not those of other folds and
+    models of residuals.
+    """
 
     lesson: str
     phase: int
     step: int
     loss: float
     val_score: float
+    candidate: bool
 
 
 class PoseGraph(nn.Module):
@@ -136,18 +141,10 @@ class Run:
 
     @property
     def best(self) -> History:
-        """The evaluation of the weights that were kept, of all networks that val chose among.
-
-        Networks of other folds are no candidates, nor are models of residuals.
-        """
+        """The evaluation of the weights that were kept, among all candidates of the last phase."""
         last_phase = max(entry.phase for entry in self.history)
         return min(
-            (
-                entry
-                for entry in self.history
-                if entry.phase == last_phase
-                and not any(part in entry.lesson for part in ("-fold", "-region"))
-            ),
+            (entry for entry in self.history if entry.phase == last_phase and entry.candidate),
             key=lambda entry: entry.val_score,
         )
 
@@ -223,10 +220,11 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
     try:
         backbone.load_state_dict(stored["backbone"])
         head = TRAINABLE[config.method].restore(setting, config.head, stored["head"])
-    except RuntimeError:
+        history = [History(*entry) for entry in stored["history"]]
+    except (RuntimeError, TypeError):
         raise UsageError(
-            f"{run_dir}: expected a network of this release, found other tensors in {NETWORK_FILE}"
+            f"{run_dir}: expected a network of this release, found another one's in "
+            f"{NETWORK_FILE}; train it anew"
         ) from None
     graph = PoseGraph(backbone, head).eval()
-    history = [History(*entry) for entry in stored["history"]]
     return Run(config, opened, split, target, graph, stored["weights_sha256"], history)

@@ -10,10 +10,10 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from statistics import NormalDist
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Struct
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -32,6 +32,7 @@ from cvo_export.networks.heads.base import (
     half_width_floor,
     interval_candidates,
 )
+from cvo_export.networks.heads.point import FeatureNoise, Hidden
 from cvo_export.networks.losses import HIGH
 from cvo_export.networks.standardised import PoseDecoder
 
@@ -42,18 +43,10 @@ Z = NormalDist().inv_cdf(HIGH)
 
 
 class TrunkConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """The choices that all baselines have.
+    """Options that all baselines have."""
 
-    Attributes
-    ----------
-    hidden
-        Widths of the trunk's two layers.
-    feature_noise
-        Standard deviation of Gaussian noise on the standardised features while training.
-    """
-
-    hidden: tuple[int, int] = (256, 128)
-    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
+    hidden: Hidden = (256, 128)
+    feature_noise: FeatureNoise = 0.1
 
 
 class IntervalNetwork(Learner):

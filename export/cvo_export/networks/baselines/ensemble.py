@@ -28,7 +28,7 @@ MEMBERS = 5
 class EnsembleConfig(
     TrunkConfig, frozen=True, tag="ensemble", tag_field="method", forbid_unknown_fields=True
 ):
-    """The choices of the members."""
+    """Options of the members."""
 
 
 class EnsembleNetwork(IntervalNetwork):

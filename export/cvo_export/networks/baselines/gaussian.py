@@ -23,7 +23,7 @@ from cvo_export.networks.heads.base import DOF, Setting
 class GaussianConfig(
     TrunkConfig, frozen=True, tag="gaussian", tag_field="method", forbid_unknown_fields=True
 ):
-    """The choices of the network."""
+    """Options of the network."""
 
 
 class GaussianNetwork(IntervalNetwork):

@@ -30,15 +30,12 @@ PASSES = 30
 class McDropoutConfig(
     TrunkConfig, frozen=True, tag="mc-dropout", tag_field="method", forbid_unknown_fields=True
 ):
-    """The choices of the network.
+    """Options of the network."""
 
-    Attributes
-    ----------
-    dropout
-        Share of each hidden layer's outputs that a mask puts to zero.
-    """
-
-    dropout: Annotated[float, Meta(gt=0, lt=1)] = 0.01
+    dropout: Annotated[
+        float,
+        Meta(gt=0, lt=1, description="Share of each hidden layer's outputs that a mask zeroes."),
+    ] = 0.01
 
 
 class McDropoutNetwork(IntervalNetwork):

@@ -25,15 +25,11 @@ _BISECTIONS = 24
 class MdnConfig(
     TrunkConfig, frozen=True, tag="mdn", tag_field="method", forbid_unknown_fields=True
 ):
-    """The choices of the network.
+    """Options of the network."""
 
-    Attributes
-    ----------
-    components
-        Gaussians in each degree of freedom's mixture.
-    """
-
-    components: Annotated[int, Meta(ge=1, le=64)] = 3
+    components: Annotated[
+        int, Meta(ge=1, le=64, description="Gaussians in the mixture of each degree of freedom.")
+    ] = 3
 
 
 class MdnNetwork(IntervalNetwork):

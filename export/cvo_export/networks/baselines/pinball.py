@@ -19,7 +19,7 @@ _LEVELS = torch.tensor([LOW, 0.5, HIGH]).view(3, 1)
 class PinballConfig(
     TrunkConfig, frozen=True, tag="pinball", tag_field="method", forbid_unknown_fields=True
 ):
-    """The choices of the network."""
+    """Options of the network."""
 
 
 class PinballNetwork(IntervalNetwork):

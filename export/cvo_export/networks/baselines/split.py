@@ -19,7 +19,7 @@ from cvo_export.networks.standardised import PoseDecoder
 class SplitConfig(
     TrunkConfig, frozen=True, tag="split", tag_field="method", forbid_unknown_fields=True
 ):
-    """The choices of the point network."""
+    """Options of the point network."""
 
 
 class SplitHead(ExportedHead):

@@ -165,10 +165,13 @@ class Lessons(Protocol):
         build: Callable[[], L],
         rows: Indices | None = None,
         examples: Examples | None = None,
+        candidate: bool = True,
     ) -> L:
         """Train what ``build`` makes on these rows, all by default; kept and resumed by name.
 
-        On features and standardised poses, unless other ``examples`` are given.
+        On features and standardised poses, unless other ``examples`` are given. ``candidate`` is
+        False for a network that is not kept, or only models residuals: its score on val is not the
+        run's.
         """
 
     def folds(self, count: int) -> list[Indices]:

@@ -32,6 +32,7 @@ from cvo_export.networks.heads.base import (
     half_width_floor,
     interval_candidates,
 )
+from cvo_export.networks.heads.point import FeatureNoise, Hidden
 from cvo_export.networks.losses import (
     CombinedCalibrationLoss,
     Gate,
@@ -49,52 +50,69 @@ _CODEBOOK_SIZE = 16
 
 
 class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unknown_fields=True):
-    """The choices of method and loss.
+    """Options of the network and its loss; see ``cvo_export.networks.losses`` for the variants.
 
-    The paper's are latent_size 3, latent sample, point_loss squared, gate literal and interval_form
+    The paper uses latent_size 3, latent sample, point_loss squared, gate literal and interval_form
     mean.
-
-    Attributes
-    ----------
-    latent_size
-        Dimension of the latent Gaussian; 3 is a bottleneck for six degrees of freedom.
-    latent
-        What inference draws: its ``mean``, the average over a fixed ``codebook`` of 16, or a
-        seeded ``sample``.
-    bounds
-        ``softplus``: distances below and above the point, so that they never cross; ``free``:
-        three free outputs, sorted.
-    hidden
-        Widths of the encoder's two layers, mirrored in the decoder.
-    sharpness
-        lambda of the combined calibration loss, 0 (calibration) to 1 (sharpness).
-    point_loss
-        Of the point: ``absolute``, as a few frames far off would pull a mean away from the middle
-        of the interval, or ``squared``.
-    gate, interval_form
-        Variants of the loss, see ``cvo_export.networks.losses``.
-    kl_weight
-        beta of the divergence from the standard Gaussian.
-    feature_noise
-        Standard deviation of Gaussian noise on the standardised features while training.
-    dropout
-        Dropout behind the encoder's and decoder's layers while training.
-    members
-        Networks that began differently, trained beside each other; point and bounds are their mean.
     """
 
-    latent_size: Annotated[int, Meta(ge=1, le=4096)] = 16
-    latent: Latent = "mean"
-    bounds: Bounds = "softplus"
-    hidden: tuple[int, int] = (256, 128)
-    sharpness: Annotated[float, Meta(ge=0, le=1)] = 0.5
-    point_loss: Literal["absolute", "squared"] = "absolute"
-    gate: Gate = "corrected"
-    interval_form: IntervalForm = "proper"
-    kl_weight: Annotated[float, Meta(ge=0)] = 1e-3
-    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
-    dropout: Annotated[float, Meta(ge=0, lt=1)] = 0.0
-    members: Annotated[int, Meta(ge=1, le=64)] = 1
+    latent_size: Annotated[
+        int, Meta(ge=1, le=4096, description="Dimension of the latent Gaussian; the paper uses 3.")
+    ] = 16
+    latent: Annotated[
+        Latent,
+        Meta(
+            description="What inference takes from the latent: its mean, the average over a "
+            "codebook of 16, or a seeded sample (the paper)."
+        ),
+    ] = "mean"
+    bounds: Annotated[
+        Bounds,
+        Meta(
+            description="softplus: distances from the point, which never cross; free: three free "
+            "outputs, sorted."
+        ),
+    ] = "softplus"
+    hidden: Hidden = (256, 128)
+    sharpness: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="Lambda of the combined calibration loss: 0 calibration, 1 sharpness.",
+        ),
+    ] = 0.5
+    point_loss: Annotated[
+        Literal["absolute", "squared"],
+        Meta(description="Loss of the point; the paper uses squared."),
+    ] = "absolute"
+    gate: Annotated[
+        Gate,
+        Meta(
+            description="Coverage that gates the calibration loss: each bound's own (corrected) "
+            "or the interval's (literal, Eq. 5a)."
+        ),
+    ] = "corrected"
+    interval_form: Annotated[
+        IntervalForm,
+        Meta(description="Penalty in the interval score; the paper uses mean."),
+    ] = "proper"
+    kl_weight: Annotated[
+        float,
+        Meta(ge=0, description="Weight of the divergence from the standard Gaussian (beta)."),
+    ] = 1e-3
+    feature_noise: FeatureNoise = 0.1
+    dropout: Annotated[
+        float, Meta(ge=0, lt=1, description="Dropout behind the hidden layers while training.")
+    ] = 0.0
+    members: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=64,
+            description="Networks with different initial weights; point and bounds are averaged.",
+        ),
+    ] = 1
 
 
 class CjpPrediction(NamedTuple):

@@ -43,6 +43,9 @@ from cvo_export.networks.heads.base import (
     interval_candidates,
 )
 from cvo_export.networks.heads.point import (
+    COMPONENTS,
+    FeatureNoise,
+    Hidden,
     PointNetwork,
     Residuals,
     check_components,
@@ -58,40 +61,29 @@ Array = NDArray[np.float64]
 
 
 class CqrConfig(Struct, frozen=True, tag="cqr", tag_field="method", forbid_unknown_fields=True):
-    """The choices of the forest and of its point network.
+    """Options of the forest and of its point network."""
 
-    Attributes
-    ----------
-    quantiles
-        Levels of the lower and the upper bound before they are conformalised.
-    trees, leaf_size
-        Number of trees; least number of rows in a leaf.
-    split_features
-        Share of the inputs that is tried at each split.
-    components
-        Principal components of the features that the forest sees, beside the point's six numbers.
-    forest
-        ``shared``: one forest for all degrees of freedom; ``per_dof``: one each, as in the paper.
-    residuals
-        ``cross_fitted``, ``held_out``, or ``auto``: cross-fitted below 1500 training frames.
-    forest_copies
-        Augmented copies of each frame among the forest's rows, besides the frame itself.
-    hidden
-        Widths of the point network's two layers.
-    feature_noise
-        Standard deviation of Gaussian noise on the standardised features while training.
-    """
-
-    quantiles: tuple[float, float] = (0.05, 0.95)
-    trees: Annotated[int, Meta(ge=1, le=10_000)] = 100
-    leaf_size: Annotated[int, Meta(ge=1)] = 10
-    split_features: Annotated[float, Meta(gt=0, le=1)] = 1 / 3
-    components: Annotated[int, Meta(ge=0, le=4096)] = 58
-    forest: Literal["shared", "per_dof"] = "shared"
+    quantiles: Annotated[
+        tuple[float, float],
+        Meta(description="Levels of lower and upper bound before conformalising."),
+    ] = (0.05, 0.95)
+    trees: Annotated[int, Meta(ge=1, le=10_000, description="Trees of the forest.")] = 100
+    leaf_size: Annotated[int, Meta(ge=1, description="Least number of rows in a leaf.")] = 10
+    split_features: Annotated[
+        float, Meta(gt=0, le=1, description="Share of the inputs tried at each split.")
+    ] = 1 / 3
+    components: Annotated[int, Meta(ge=0, le=4096, description=COMPONENTS)] = 58
+    forest: Annotated[
+        Literal["shared", "per_dof"],
+        Meta(description="One forest for all degrees of freedom, or one each (the paper)."),
+    ] = "shared"
     residuals: Residuals = "auto"
-    forest_copies: Annotated[int, Meta(ge=0)] = 3
-    hidden: tuple[int, int] = (256, 128)
-    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
+    forest_copies: Annotated[
+        int,
+        Meta(ge=0, description="Augmented copies of each frame among the forest's rows."),
+    ] = 3
+    hidden: Hidden = (256, 128)
+    feature_noise: FeatureNoise = 0.1
 
     def __post_init__(self) -> None:
         """Refuse levels that bound nothing."""

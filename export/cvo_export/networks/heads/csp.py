@@ -31,6 +31,7 @@ from cvo_export.networks.heads.base import (
     Standardise,
     dense,
 )
+from cvo_export.networks.heads.point import FeatureNoise, Hidden
 from cvo_export.networks.standardised import PoseDecoder
 
 Array = NDArray[np.float64]
@@ -47,30 +48,32 @@ _SIGMAS = (1.5, 4.0, 10.0)
 
 
 class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unknown_fields=True):
-    """The choices of classes, labels and network; the paper's labels are one_hot.
+    """Options of classes, labels and network; the paper uses one_hot labels."""
 
-    Attributes
-    ----------
-    classes
-        K, for each degree of freedom; fewer where training poses repeat.
-    labels
-        ``ordinal``: a Gaussian over the classes about the truth; ``one_hot``.
-    label_sigma
-        Standard deviation of that Gaussian, in classes; None lets val choose among 1.5, 4 and 10.
-    hidden
-        Widths of the trunk's two layers.
-    feature_noise
-        Standard deviation of Gaussian noise on the standardised features while training.
-    dropout
-        Dropout behind the trunk's layers while training.
-    """
-
-    classes: Annotated[int, Meta(ge=2, le=256)] = 128
-    labels: Literal["ordinal", "one_hot"] = "ordinal"
-    label_sigma: Annotated[float, Meta(gt=0)] | None = None
-    hidden: tuple[int, int] = (256, 128)
-    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
-    dropout: Annotated[float, Meta(ge=0, lt=1)] = 0.0
+    classes: Annotated[
+        int,
+        Meta(
+            ge=2,
+            le=256,
+            description="Classes of each degree of freedom (K); fewer where training poses repeat.",
+        ),
+    ] = 128
+    labels: Annotated[
+        Literal["ordinal", "one_hot"],
+        Meta(description="ordinal: a Gaussian over the classes; one_hot: the paper's."),
+    ] = "ordinal"
+    label_sigma: Annotated[
+        Annotated[float, Meta(ge=0.01)] | None,
+        Meta(
+            description="Deviation of ordinal labels in classes; if not given, val chooses among "
+            "1.5, 4 and 10."
+        ),
+    ] = None
+    hidden: Hidden = (256, 128)
+    feature_noise: FeatureNoise = 0.1
+    dropout: Annotated[
+        float, Meta(ge=0, lt=1, description="Dropout behind the hidden layers while training.")
+    ] = 0.0
 
 
 class Classes(nn.Module):

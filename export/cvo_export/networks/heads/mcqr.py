@@ -46,6 +46,9 @@ from cvo_export.networks.heads.base import (
     interval_candidates,
 )
 from cvo_export.networks.heads.point import (
+    COMPONENTS,
+    FeatureNoise,
+    Hidden,
     PointNetwork,
     Residuals,
     check_components,
@@ -68,55 +71,60 @@ _DROPOUT, _PASSES = 0.05, 20
 
 
 class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unknown_fields=True):
-    """The choices of the region and of its point network.
+    """Options of the region and of its point network.
 
-    The paper's are augmentation predictions and scale constant.
-
-    Attributes
-    ----------
-    augmentation
-        What MC-dropout passes of the point network add to the region's training data: with
-        ``predictions`` each pass is a point of its own, with its own condition and residual; with
-        ``labels`` the condition stays that of the deterministic point; ``none``: no passes.
-    passes
-        Stochastic passes of each frame; None: 20.
-    dropout
-        Behind the point network's last hidden layer; None: 0.05 where there are passes, else 0.
-    components
-        Principal components of the features in the condition, beside the point's six numbers.
-    scale
-        ``local``: the codebook's unit is a matrix that the condition decides; ``constant``: the
-        spread of all residuals.
-    kappa
-        Inflation of the learned region; None lets val choose.
-    directions, rays
-        Directions whose quantiles are learned; rays of the codebook, with three points each.
-    tau
-        Level of the directional quantiles.
-    kl_weight
-        beta of the autoencoder.
-    condition_noise
-        Standard deviation of Gaussian noise on the standardised condition while training.
-    residuals
-        ``cross_fitted``, ``held_out``, or ``auto``: cross-fitted below 1500 training frames.
-    hidden, feature_noise
-        Of the point network, as in CQR.
+    The paper uses augmentation predictions and scale constant. With ``predictions`` each MC-dropout
+    pass is a point with its own condition and residual; with ``labels`` the condition stays that of
+    the deterministic point.
     """
 
-    augmentation: Literal["none", "predictions", "labels"] = "none"
-    passes: Annotated[int, Meta(ge=1, le=1000)] | None = None
-    dropout: Annotated[float, Meta(ge=0, lt=1)] | None = None
-    components: Annotated[int, Meta(ge=0, le=4096)] = 16
-    scale: Literal["local", "constant"] = "local"
-    kappa: Annotated[float, Meta(gt=0)] | None = None
-    directions: Annotated[int, Meta(ge=8, le=4096)] = 128
-    rays: Annotated[int, Meta(ge=1, le=192)] = 128
-    tau: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05
-    kl_weight: Annotated[float, Meta(ge=0)] = 0.01
-    condition_noise: Annotated[float, Meta(ge=0)] = 0.05
+    augmentation: Annotated[
+        Literal["none", "predictions", "labels"],
+        Meta(description="MC-dropout passes as training data; the paper uses predictions."),
+    ] = "none"
+    passes: Annotated[
+        Annotated[int, Meta(ge=1, le=1000)] | None,
+        Meta(description="Stochastic passes of each frame; 20 with augmentation."),
+    ] = None
+    dropout: Annotated[
+        Annotated[float, Meta(ge=0, lt=1)] | None,
+        Meta(
+            description="Dropout behind the point network's last hidden layer; if not given, 0.05 "
+            "with augmentation, else 0."
+        ),
+    ] = None
+    components: Annotated[int, Meta(ge=0, le=4096, description=COMPONENTS)] = 16
+    scale: Annotated[
+        Literal["local", "constant"],
+        Meta(
+            description="Unit of the codebook: a matrix for each condition (local) or the spread "
+            "of all residuals (constant, the paper)."
+        ),
+    ] = "local"
+    kappa: Annotated[
+        Annotated[float, Meta(ge=0.01)] | None,
+        Meta(description="Inflation of the learned region; if not given, val chooses."),
+    ] = None
+    directions: Annotated[
+        int, Meta(ge=8, le=4096, description="Directions whose quantiles are learned.")
+    ] = 128
+    rays: Annotated[
+        int, Meta(ge=1, le=192, description="Rays of the codebook, three points each.")
+    ] = 128
+    tau: Annotated[float, Meta(gt=0, lt=0.5, description="Level of the directional quantiles.")] = (
+        0.05
+    )
+    kl_weight: Annotated[
+        float,
+        Meta(ge=0, description="Weight of the divergence from the standard Gaussian (beta)."),
+    ] = 0.01
+    condition_noise: Annotated[
+        float,
+        Meta(ge=0, description="Deviation of the noise added to the condition while training."),
+    ] = 0.05
     residuals: Residuals = "auto"
-    hidden: tuple[int, int] = (256, 128)
-    feature_noise: Annotated[float, Meta(ge=0)] = 0.1
+    hidden: Hidden = (256, 128)
+    feature_noise: FeatureNoise = 0.1
 
     def __post_init__(self) -> None:
         """Refuse passes that are all the same, and their number where there are none."""
@@ -268,7 +276,9 @@ def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
         torch.cat([val_small, val_point], dim=1),
         val_residual / unit,
     )
-    learner = lessons.learn("mcqr-region", lambda: RegionLearner(config), examples=examples)
+    learner = lessons.learn(
+        "mcqr-region", lambda: RegionLearner(config), examples=examples, candidate=False
+    )
     choice = _choice(learner, examples, config, setting.seed)
     points = torch.from_numpy(choice.points)
     learner.network.keep(points)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
+from msgspec import Meta
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -24,7 +25,20 @@ from cvo_export.networks.standardised import PoseDecoder
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Residuals = Literal["auto", "cross_fitted", "held_out"]
+Residuals = Annotated[
+    Literal["auto", "cross_fitted", "held_out"],
+    Meta(
+        description="Frames that residuals come from: cross_fitted, held_out, or auto: "
+        "cross_fitted below 1500 training frames."
+    ),
+]
+# Fields that the options of several methods share.
+COMPONENTS = "Principal components of the features that the model sees besides the point."
+Hidden = Annotated[tuple[int, int], Meta(description="Widths of the two hidden layers.")]
+FeatureNoise = Annotated[
+    float,
+    Meta(ge=0, description="Deviation of the noise added to the features while training."),
+]
 
 # Fewer training frames than this are too few to set a part aside for models of residuals.
 _MANY_FRAMES = 1500
@@ -149,10 +163,13 @@ def learn_held_out(
             "residuals: expected held_out with a backbone that learns, too, found cross_fitted"
         )
 
-    def learn(lesson: str, rows: Indices) -> PointNetwork:
+    def learn(lesson: str, rows: Indices, candidate: bool = True) -> PointNetwork:
         size = lessons.setting.feature_size
         return lessons.learn(
-            lesson, lambda: PointLearner(size, hidden, feature_noise, dropout), rows
+            lesson,
+            lambda: PointLearner(size, hidden, feature_noise, dropout),
+            rows,
+            candidate=candidate,
         ).network
 
     if not cross_fitted:
@@ -160,7 +177,7 @@ def learn_held_out(
         rows = everything[lessons.n_train :]
         return HeldOut(network, rows, [(rows, network)])
     parts = [
-        (fold, learn(f"{name}-fold{number}", np.setdiff1d(everything, fold)))
+        (fold, learn(f"{name}-fold{number}", np.setdiff1d(everything, fold), candidate=False))
         for number, fold in enumerate(lessons.folds(_FOLDS))
     ]
     return HeldOut(learn(name, everything), everything, parts)

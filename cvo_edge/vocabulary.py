@@ -1,0 +1,22 @@
+"""The words that options and files choose from; importing this module costs nothing.
+
+The command lines build their choices from these types, before numpy or a model is imported.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+Scope = Literal["marginal", "joint"]
+Mode = Literal["live", "latency", "throughput"]
+Format = Literal["jsonl", "csv", "tum", "table"]
+Crop = Literal["none", "centre"]
+Precision = Literal["fp32", "int8"]
+Provider = Literal["onnxruntime", "openvino"]
+Sides = Literal["symmetric", "asymmetric", "lower", "upper"]
+Joint = Literal["max", "bonferroni"]
+Rule = Literal["pooled", "hierarchical"]
+SplitKind = Literal["random", "block", "sequence"]
+
+SCOPES: tuple[Scope, ...] = get_args(Scope)
+MODES: tuple[Mode, ...] = get_args(Mode)
