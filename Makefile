@@ -119,7 +119,7 @@ release: $(RELEASE_VENV)/.installed ## build wheels and sdists of both packages,
 	mkdir -p $(SOURCE) build/release/sdist dist
 	git -c tar.umask=0022 archive HEAD | tar --extract --preserve-permissions --directory=$(SOURCE)
 	umask 022; for project in $(SOURCE) $(SOURCE)/export; do \
-	    $(RELEASE_VENV)/bin/python -m build --no-isolation --outdir dist $$project || exit 1; \
+	    $(RELEASE_VENV)/bin/python -m build --quiet --no-isolation --outdir dist $$project || exit 1; \
 	done
 	for name in cvo_edge-$(VERSION) cvo_export-$(VERSION); do \
 	    tar --extract --file=dist/$$name.tar.gz --directory=build/release/sdist && \
