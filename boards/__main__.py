@@ -38,7 +38,7 @@ from boards.frames import DATASET, write_test_frames
 from boards.machine import BOARDS, FOLDER, ROOT, Board, SetUpError, emulator_version, set_up
 from cvo_edge.bundle.format import CALIBRATION_FILE, Calibration
 from cvo_edge.bundle.reading import read_calibration
-from cvo_edge.cores import allowed_cores
+from cvo_edge.engine.cores import allowed_cores
 from cvo_edge.errors import CvoError
 from cvo_edge.ground_truth import MATRIX_SUFFIX, read_pose_matrix
 from cvo_edge.pose import Chart

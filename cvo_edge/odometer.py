@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from cvo_edge.bundle.format import Threshold
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.model_cache import ModelCache
+from cvo_edge.engine.observer import Observation, Observer
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import ModelError, UsageError
 from cvo_edge.estimate import PoseInterval, Reason, Status
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.frame_checks import StreamChecks
-from cvo_edge.observer import Observation, Observer
 from cvo_edge.pose import Pose
 from cvo_edge.scheduling import checked_mode, plan, run_stream
 from cvo_edge.sets import ConformalSet, unbounded_set

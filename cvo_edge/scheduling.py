@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.cores import checked_threads
+from cvo_edge.engine.cores import checked_threads
 from cvo_edge.errors import UsageError
 from cvo_edge.input.capture import READER
 from cvo_edge.input.frame import Frame, Source

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import ModelSpec
-from cvo_edge.cores import checked_threads
+from cvo_edge.engine.cores import checked_threads
 from cvo_edge.engine.session import Session, one_line
 from cvo_edge.errors import ModelError
 

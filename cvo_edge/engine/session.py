@@ -19,7 +19,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Dtype, ModelSpec, TensorSpec
-from cvo_edge.cores import checked_threads, cores_of_threads
+from cvo_edge.engine.cores import checked_threads, cores_of_threads
 from cvo_edge.engine.model_cache import GRAPH_FILE, WEIGHTS_FILE, PreparedModel
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 

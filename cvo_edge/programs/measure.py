@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cvo_edge.cores import allowed_cores
+from cvo_edge.engine.cores import allowed_cores
 
 STAGES = ("read", "preprocess", "model", "conformal", "total")
 

@@ -164,7 +164,7 @@ def child() -> None:
 def _selftest(
     folder: str, threads: int | None, timeout_s: float, public_key: str | None
 ) -> Verdict:
-    from cvo_edge.cores import checked_threads
+    from cvo_edge.engine.cores import checked_threads
     from cvo_edge.engine.loading import Bundle, prepared_model, read_bundle
     from cvo_edge.engine.model_cache import ModelCache
     from cvo_edge.odometer import Odometer

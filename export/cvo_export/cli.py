@@ -513,7 +513,7 @@ def study(
 
     Repeat the command to resume. OUT gets results.json, report.html and pictures.
     """
-    from cvo_edge.cores import allowed_cores
+    from cvo_edge.engine.cores import allowed_cores
     from cvo_export.study.cells import CellFolder
     from cvo_export.study.grid import read_study, run_study
     from cvo_export.study.ray_engine import ray_engine

@@ -10,8 +10,8 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from cvo_edge.cores import allowed_cores, cgroup_cores
 from cvo_edge.engine import session
+from cvo_edge.engine.cores import allowed_cores, cgroup_cores
 from cvo_edge.errors import ModelError
 from cvo_edge.input import preprocess
 from cvo_edge.odometer import Odometer
@@ -59,7 +59,7 @@ def test_no_control_groups_are_no_quota(tmp_path):
 @pytest.mark.parametrize(("quota", "expected"), [(math.inf, 2), (0.3, 1), (1.2, 2), (64.0, 2)])
 def test_cores_are_those_of_affinity_and_quota(monkeypatch, quota, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5})
-    monkeypatch.setattr("cvo_edge.cores.cgroup_cores", lambda: quota)
+    monkeypatch.setattr("cvo_edge.engine.cores.cgroup_cores", lambda: quota)
     assert allowed_cores() == expected
 
 

@@ -12,7 +12,7 @@ from cvo_edge.heads import HEADS
 from cvo_edge.output.records import read_records
 from cvo_edge.programs import cli as runtime
 from cvo_export import cli as training
-from cvo_export.networks.heads import METHODS
+from cvo_export.networks.methods import TRAINABLE
 
 from . import toy_network
 from .conftest import DATASET
@@ -25,7 +25,7 @@ SMALL = ["--weights", "none", "--size", "64x48", "--copies", "1", "--steps", "10
 def _registered():
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(HEADS, "toy", ToyHead)
-        patch.setitem(METHODS, "toy", toy_network.METHOD)
+        patch.setitem(TRAINABLE, "toy", toy_network.METHOD)
         yield
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from cvo_edge.cores import allowed_cores
+from cvo_edge.engine.cores import allowed_cores
 from cvo_export.bundles.draft import versions
 from cvo_export.data.splits import default_kind
 from cvo_export.datasets import open_dataset

@@ -10,7 +10,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from cvo_edge.cores import allowed_cores
+from cvo_edge.engine.cores import allowed_cores
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.measure import environment, quantiles
 from cvo_export.datasets import PoseDataset

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any, cast
+from typing import Any
 
 import msgspec
+from msgspec import Struct
 
 from cvo_edge.errors import UsageError
 from cvo_edge.vocabulary import Crop, SplitKind
@@ -14,7 +15,7 @@ from cvo_export.data.augment import AugmentConfig
 from cvo_export.data.splits import default_kind
 from cvo_export.datasets import open_dataset
 from cvo_export.networks.backbone import NO_WEIGHTS, TIMM_WEIGHTS, BackboneConfig
-from cvo_export.networks.methods import TRAINABLE, TrainableConfig
+from cvo_export.networks.methods import TRAINABLE, options_of
 from cvo_export.training.options import option_name
 from cvo_export.training.run import TrainConfig
 from cvo_export.vocabulary import Normalisation
@@ -67,7 +68,7 @@ def configure(
     )
 
 
-def head_config(method: str, options: dict[str, Any]) -> TrainableConfig:
+def head_config(method: str, options: dict[str, Any]) -> Struct:
     """Return a method's options, checked; None stands for the default of each.
 
     Raises UsageError for an unknown method, an option that the method does not have, and a value
@@ -86,7 +87,7 @@ def head_config(method: str, options: dict[str, Any]) -> TrainableConfig:
         if isinstance(value, float) and not math.isfinite(value):
             raise UsageError(f"{option_name(name)}: expected a finite number, found {value}")
     try:
-        return cast("TrainableConfig", msgspec.convert({"method": method, **given}, kind))
+        return options_of({"method": method, **given})
     except msgspec.ValidationError as error:
         raise UsageError(_refusal(str(error), method, given)) from None
 

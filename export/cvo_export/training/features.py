@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cvo_edge.cores import allowed_cores
+from cvo_edge.engine.cores import allowed_cores
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import SinkError, SourceError
 from cvo_edge.input import preprocess

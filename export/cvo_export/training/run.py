@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import torch
@@ -18,7 +18,7 @@ from cvo_export.data.splits import Split, make_split, read_split_spec, same_spli
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.networks.backbone import Backbone, BackboneConfig
 from cvo_export.networks.heads import ExportedHead, Setting
-from cvo_export.networks.methods import TRAINABLE, TrainableConfig
+from cvo_export.networks.methods import TRAINABLE, options_of
 from cvo_export.networks.standardised import Target
 
 CONFIG_FILE = "config.json"
@@ -41,7 +41,7 @@ class TrainConfig:
     augment, copies
         How the augmented copies of each training frame are changed, and how many there are.
     head
-        The method and its own options: the network behind the features and its loss.
+        The method's own struct of options: the network behind the features and its loss.
     steps, batch_size, learning_rate, weight_decay
         AdamW on cached features; the rate rises over 50 steps and falls as a cosine.
     warm_up_steps
@@ -57,7 +57,7 @@ class TrainConfig:
 
     dataset: str
     split: SplitKind
-    head: TrainableConfig
+    head: Any
     seed: int = 0
     height: int = 192
     width: int = 256
@@ -80,6 +80,16 @@ class TrainConfig:
     def method(self) -> str:
         """Name of the method or baseline, the tag of its options."""
         return str(self.head.__struct_config__.tag)
+
+
+def decode_config(content: bytes) -> TrainConfig:
+    """Read what ``config.json`` holds; raises msgspec.MsgspecError where it is something else.
+
+    The method's options are read on their own: a method may have been registered after this module
+    was imported.
+    """
+    config = msgspec.json.decode(content, type=TrainConfig)
+    return replace(config, head=options_of(config.head))
 
 
 class History(NamedTuple):
@@ -205,7 +215,7 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
     if not path.is_file():
         raise UsageError(f"{run_dir}: expected a finished run, found no {NETWORK_FILE}")
     try:
-        config = msgspec.json.decode((run_dir / CONFIG_FILE).read_bytes(), type=TrainConfig)
+        config = decode_config((run_dir / CONFIG_FILE).read_bytes())
         recorded = read_split_spec(run_dir / SPLIT_FILE)
         stored = torch.load(path, weights_only=True)
     # torch.load raises what its unpickler and its zip reader happen to raise.

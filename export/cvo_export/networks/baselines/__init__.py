@@ -9,7 +9,7 @@ from __future__ import annotations
 from cvo_export.networks.baselines import ensemble, gaussian, mc_dropout, mdn, pinball, split
 from cvo_export.networks.heads.base import Method
 
-__all__ = ["BASELINES", "BaselineConfig"]
+__all__ = ["BASELINES"]
 
 BASELINES: dict[str, Method] = {
     "mc-dropout": mc_dropout.METHOD,
@@ -19,12 +19,3 @@ BASELINES: dict[str, Method] = {
     "pinball": pinball.METHOD,
     "split": split.METHOD,
 }
-
-BaselineConfig = (
-    mc_dropout.McDropoutConfig
-    | ensemble.EnsembleConfig
-    | gaussian.GaussianConfig
-    | mdn.MdnConfig
-    | pinball.PinballConfig
-    | split.SplitConfig
-)

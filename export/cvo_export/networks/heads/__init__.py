@@ -9,7 +9,7 @@ from __future__ import annotations
 from cvo_export.networks.heads import cjp, cqr, csp, mcqr
 from cvo_export.networks.heads.base import ExportedHead, Lessons, Method, Setting
 
-__all__ = ["METHODS", "ExportedHead", "HeadConfig", "Lessons", "Method", "Setting"]
+__all__ = ["METHODS", "ExportedHead", "Lessons", "Method", "Setting"]
 
 METHODS: dict[str, Method] = {
     "cjp": cjp.METHOD,
@@ -17,5 +17,3 @@ METHODS: dict[str, Method] = {
     "csp": csp.METHOD,
     "mcqr": mcqr.METHOD,
 }
-
-HeadConfig = cjp.CjpConfig | cqr.CqrConfig | csp.CspConfig | mcqr.McqrConfig
