@@ -1,4 +1,4 @@
-"""The README's table of methods and baselines from bench/results/compare/*.json.
+"""The table of methods and baselines from bench/results/compare/*.json.
 
 python bench/compare_table.py redkitchen kitchen_flights
 """
@@ -9,7 +9,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,24 +21,48 @@ HEADER = (
 )
 
 Cell = dict[str, Any]
-# One of each recording.
-Reports = list[dict[str, Any]]
+
+
+class Report(NamedTuple):
+    """Figures of one recording; ``ms`` is the median time of a frame by method."""
+
+    data: str
+    split: str
+    cells: list[Cell]
+    ms: dict[str, float]
+
+
+# One for each recording.
+Reports = list[Report]
 
 
 def main() -> None:
     """Print one table of the recordings named on the command line, a figure of each in a cell."""
-    reports = [json.loads((RESULTS / f"{name}.json").read_text("utf-8")) for name in sys.argv[1:]]
-    methods = {cell["method"] for report in reports for cell in report["cells"]}
-    print(", ".join(f"{report['dataset']} ({report['options']['split']})" for report in reports))
+    reports = [read(RESULTS / f"{name}.json") for name in sys.argv[1:]]
+    methods = {cell["method"] for report in reports for cell in report.cells}
+    print(", ".join(f"{report.data} ({report.split})" for report in reports))
     print(HEADER)
     # The sum of logarithms: recordings of any difficulty count alike.
     for method in sorted(methods, key=lambda name: np.log(scores(reports, name)).sum()):
         print(row(reports, method))
 
 
+def read(path: Path) -> Report:
+    """Read ``results.json`` of ``cvo-export compare``, or ``compare.json`` of earlier versions."""
+    content = json.loads(path.read_text("utf-8"))
+    cells = content["cells"]
+    if isinstance(cells, list):
+        ms = {method: figures["p50"] for method, figures in content["timing"]["ms"].items()}
+        return Report(content["dataset"], content["options"]["split"], cells, ms)
+    (timing,) = content["timing"].values()
+    ms = {cells[name]["method"]: figures["p50"] for name, figures in timing["ms"].items()}
+    place = content["places"][0]
+    return Report(place["data"], place["split"], list(cells.values()), ms)
+
+
 def row(reports: Reports, method: str) -> str:
     """Return a method's line; scores within 2 % of the recording's best are bold."""
-    best = np.min([scores(reports, name) for name in reports[0]["heads"]], axis=0)
+    best = np.min([scores(reports, name) for name in reports[0].ms], axis=0)
     marked = [
         f"**{score:.3f}**" if score <= 1.02 * least else f"{score:.3f}"
         for score, least in zip(scores(reports, method), best, strict=True)
@@ -63,7 +87,7 @@ def row(reports: Reports, method: str) -> str:
         ),
         each("{:.0f} s", lambda c: c["training"] and c["training"]["processor"]),
         f"{head / 1e6:.2f} M",
-        ", ".join(f"{report['timing']['ms'][method]['p50']:.2f} ms" for report in reports),
+        ", ".join(f"{report.ms[method]:.2f} ms" for report in reports),
     ]
     return "| " + " | ".join(parts) + " |"
 
@@ -77,15 +101,15 @@ def scores(reports: Reports, method: str) -> list[float]:
     return [value for value in found if value is not None]
 
 
-def median(report: dict[str, Any], method: str, figure: Callable[[Cell], Any]) -> float | None:
+def median(report: Report, method: str, figure: Callable[[Cell], Any]) -> float | None:
     """Return the median over the seeds that have this figure, None where none has."""
     found = [value for value in map(figure, cells(report, method)) if value is not None]
     return float(np.median(found)) if found else None
 
 
-def cells(report: dict[str, Any], method: str) -> list[Cell]:
-    """Return the cells of a method, one a seed."""
-    return [cell for cell in report["cells"] if cell["method"] == method]
+def cells(report: Report, method: str) -> list[Cell]:
+    """Return the cells of a method, one for each seed."""
+    return [cell for cell in report.cells if cell["method"] == method]
 
 
 if __name__ == "__main__":

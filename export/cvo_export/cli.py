@@ -602,11 +602,12 @@ def evaluate(
 @app.command()
 def compare(
     dataset: DatasetArgument,
-    out: Annotated[Path, typer.Argument(help="Folder of the comparison; or one to go on with.")],
+    out: Annotated[Path, typer.Argument(help="New folder; or one to resume, same options.")],
     methods: Annotated[
-        str | None, typer.Option(help="Names with commas; all methods and baselines by default.")
+        str | None,
+        typer.Option(help="Names separated by commas; all methods and baselines by default."),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="How many, from 0 on.")] = 3,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0 on.")] = 3,
     split: Annotated[
         SplitName | None,
         typer.Option(help="sequence where there are five or more, else block."),
@@ -618,43 +619,44 @@ def compare(
     steps: StepsOption = None,
     copies: CopiesOption = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at a time; all allowed cores by default.")
+        int | None, typer.Option(min=1, help="Parallel runs; all allowed cores by default.")
     ] = None,
     cache: Annotated[
-        Path | None, typer.Option(help="Folder of features; by default in OUT.")
+        Path | None, typer.Option(help="Folder of features that runs share; by default in OUT.")
     ] = None,
 ) -> None:
     """Train, publish and evaluate methods and baselines over seeds, and time their frames.
 
-    Interrupted, the same command goes on. OUT gets compare.json and the table compare.txt.
+    A study of one grid. After an interruption the same command resumes. OUT gets results.json and
+    the table compare.txt.
     """
+    from cvo_edge.cores import allowed_cores
     from cvo_export.networks.methods import TRAINABLE
+    from cvo_export.study.cells import CellFolder
     from cvo_export.study.compare import compare as compare_methods
+    from cvo_export.study.grid import Grid
+    from cvo_export.study.workers import run_tasks
 
-    _open(dataset)
-    options = {
-        "dataset": dataset,
-        "split": split.value if split else None,
-        "size": "256x192",
-        "crop": "none",
-        "backbone": backbone,
-        "weights": weights,
-        "stages": stages,
-        "grid": grid,
-        "normalisation": None,
-        "steps": steps,
-        "copies": copies,
-    }
+    preset = Grid(
+        name="compare",
+        data=[dataset],
+        methods=list(TRAINABLE) if methods is None else methods.split(","),
+        split=split.value if split else None,
+        backbones=[backbone],
+        weights=weights,
+        seeds=seeds,
+        stages=stages,
+        grid=grid,
+        copies=copies,
+        steps=steps,
+    )
     with show_progress() as progress:
         lines = compare_methods(
-            out,
-            options,
-            list(TRAINABLE) if methods is None else methods.split(","),
-            seeds,
-            jobs=jobs,
-            cache=cache,
-            progress=progress,
-            say=partial(print, file=sys.stderr, flush=True),
+            preset,
+            CellFolder.in_folder(out, cache),
+            partial(run_tasks, jobs or allowed_cores()),
+            progress,
+            partial(print, file=sys.stderr, flush=True),
         )
     print(*lines, sep="\n")
 
@@ -662,20 +664,20 @@ def compare(
 @app.command()
 def study(
     config: Annotated[Path, typer.Argument(help="Grids to run, TOML.", show_default=False)],
-    out: Annotated[Path, typer.Argument(help="Folder of the study; or one to go on with.")],
+    out: Annotated[Path, typer.Argument(help="New folder; or one to resume or extend.")],
     engine: Annotated[
         EngineName, typer.Option(help="Processes of this machine, or a Ray cluster.")
     ] = EngineName.LOCAL,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="local: runs at a time; all allowed cores by default.")
+        int | None, typer.Option(min=1, help="local: parallel runs; all allowed cores by default.")
     ] = None,
     cache: Annotated[
-        Path | None, typer.Option(help="Folder of features; by default in OUT.")
+        Path | None, typer.Option(help="Folder of features that runs share; by default in OUT.")
     ] = None,
 ) -> None:
     """Run grids of methods, backbones, data, noise, options and seeds, and report on them.
 
-    Interrupted, the same command goes on. OUT gets results.json, report.html and pictures.
+    After an interruption the same command resumes. OUT gets results.json, report.html and pictures.
     """
     from cvo_edge.cores import allowed_cores
     from cvo_export.study.cells import CellFolder
@@ -685,13 +687,13 @@ def study(
     from cvo_export.study.workers import run_tasks
 
     if engine is EngineName.RAY and jobs is not None:
-        raise UsageError("jobs: expected with the engine local alone, found it with ray")
-    # Hours later would be late to learn that a page cannot be written.
+        raise UsageError("--jobs belongs to --engine local; Ray runs one cell on each of its cores")
+    # Fail before hours of training, not after.
     template = page_template()
     grids = read_study(config)
     local = nullcontext(partial(run_tasks, jobs or allowed_cores()))
     with local if engine is EngineName.LOCAL else ray_engine() as run, show_progress() as progress:
-        folder = CellFolder(out.resolve(), (cache or out / "features").resolve())
+        folder = CellFolder.in_folder(out, cache)
         say = partial(print, file=sys.stderr, flush=True)
         results = run_study(grids, folder, run, progress, say)
     print(write_report(results, folder, template))
