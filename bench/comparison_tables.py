@@ -21,7 +21,7 @@ Report = dict[str, Any]
 
 def comparison() -> str:
     """Return one line a method, with the figures of both recordings as pairs."""
-    found = [read_result("compare", name) for name in RECORDINGS]
+    found = [_report(name) for name in RECORDINGS]
     methods = {cell["method"] for report in found for cell in report["cells"]}
     head = [
         *("", "score, own bounds", "score, calibrated", "coverage per DoF"),
@@ -31,6 +31,20 @@ def comparison() -> str:
     # The sum of logarithms: recordings of any difficulty count alike.
     order = sorted(methods, key=lambda name: float(np.log(scores(found, name)).sum()))
     return table(head, [_row(found, method) for method in order])
+
+
+def _report(recording: str) -> Report:
+    """Return what ``cvo-export compare`` wrote of a recording, now or before it was a study."""
+    found = read_result("compare", recording)
+    if isinstance(found["cells"], list):
+        return found
+    cells = found["cells"]
+    (timing,) = found["timing"].values()
+    return {
+        "cells": list(cells.values()),
+        "heads": dict.fromkeys(cell["method"] for cell in cells.values()),
+        "timing": {"ms": {cells[name]["method"]: ms for name, ms in timing["ms"].items()}},
+    }
 
 
 def _row(found: list[Report], method: str) -> list[str]:
@@ -66,7 +80,7 @@ def _row(found: list[Report], method: str) -> list[str]:
 
 def own_bounds(recording: str) -> str:
     """Return coverage, all six at once and width of one recording, own bounds and calibrated."""
-    report = read_result("compare", recording)
+    report = _report(recording)
     rows = []
     for method in report["heads"]:
         for bounds, label in (("own", f"{method}, own bounds"), ("marginal", method)):

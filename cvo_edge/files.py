@@ -1,4 +1,4 @@
-"""Files: reading those from outside within bounds, writing whole or not at all, own folders."""
+"""Read files from outside within bounds, write files whole or not at all, find our own folders."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import io
 import os
 import stat
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from cvo_edge.errors import CvoError, SinkError, UsageError
 
@@ -58,15 +61,89 @@ def read_regular_file(
     return content
 
 
+@contextmanager
+def whole_file(
+    path: Path, *, durable: bool = False, make_folder: bool = False
+) -> Iterator[BinaryIO]:
+    """Yield a stream whose content becomes the file once the block ends; nothing remains otherwise.
+
+    Readers see the old file or the whole new one. A link at ``path`` is replaced, not followed.
+
+    Parameters
+    ----------
+    durable
+        Flush the file and its folder to the disk, so that the same holds after a loss of power.
+    make_folder
+        Create the folder and its parents where they are missing.
+
+    Raises
+    ------
+    SinkError
+        The file cannot be written.
+    """
+    # A random name: processes on several machines may write to one shared folder.
+    unfinished = path.with_name(f"{path.name}.{os.urandom(4).hex()}.partial")
+    try:
+        if make_folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        opened = unfinished.open("xb")
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    try:
+        with opened as stream:
+            yield stream
+            if durable:
+                stream.flush()
+                os.fsync(stream.fileno())
+        unfinished.replace(path)
+        if durable:
+            _flush_folder(path.parent)
+    except BaseException as error:
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+        # torch.save turns a failed write into a RuntimeError of its own.
+        cause = error if isinstance(error, OSError) else error.__context__
+        if isinstance(error, Exception) and isinstance(cause, OSError):
+            raise _unwritable(path, cause) from None
+        raise
+
+
+def _unwritable(path: Path | str, error: OSError) -> SinkError:
+    return SinkError(f"{path}: cannot be written: {error.strerror}")
+
+
+def _flush_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_whole(
+    path: Path, content: str | bytes, *, durable: bool = False, make_folder: bool = False
+) -> None:
+    """Write text (UTF-8) or bytes to a file, as ``whole_file`` does; raises SinkError."""
+    with whole_file(path, durable=durable, make_folder=make_folder) as stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+
+
 def write_text(target: str, text: str) -> None:
-    """Write text to a file, or to standard output for ``-``; raises SinkError."""
+    """Write text to a file, or to standard output for ``-``; raises SinkError.
+
+    A regular file is replaced whole; a pipe, a device or a link is written to.
+    """
     if target == "-":
         sys.stdout.write(text)
         return
+    path = Path(target)
     try:
-        Path(target).write_text(text, "utf-8")
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            path.write_text(text, "utf-8")
+            return
     except OSError as error:
-        raise SinkError(f"{target}: cannot be written: {error.strerror}") from None
+        raise _unwritable(target, error) from None
+    write_whole(path, text)
 
 
 def own_folder(variable: str, base_variable: str, base: str) -> Path:

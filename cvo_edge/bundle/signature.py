@@ -14,8 +14,6 @@ import contextlib
 import fcntl
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +24,7 @@ from msgspec import Meta, Struct
 
 from cvo_edge.bundle.format import Calibration, Sha256, Text
 from cvo_edge.errors import BundleMismatchError, SinkError, UsageError
-from cvo_edge.files import own_folder, read_regular_file
+from cvo_edge.files import own_folder, read_regular_file, write_whole
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -196,20 +194,7 @@ class Versions:
 
     def _write(self, known: dict[str, dict[str, int]]) -> None:
         """The whole new file or the old one, also after a loss of power."""
-        with tempfile.NamedTemporaryFile(dir=self.path.parent, delete=False) as stream:
-            try:
-                stream.write(json.dumps(known, indent=1).encode())
-                stream.flush()
-                os.fsync(stream.fileno())
-                Path(stream.name).replace(self.path)
-            except BaseException:
-                Path(stream.name).unlink(missing_ok=True)
-                raise
-        folder = os.open(self.path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        write_whole(self.path, json.dumps(known, indent=1), durable=True)
 
 
 def _read_signature(path: Path) -> Signature:

@@ -28,7 +28,8 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from cvo_edge.files import own_folder
+from cvo_edge.errors import SinkError
+from cvo_edge.files import own_folder, write_whole
 
 GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
 SEEN_FILE = "seen.json"
@@ -151,11 +152,8 @@ class ModelCache:
         if time.time_ns() - max(before.ctime_ns, before.mtime_ns) < _SETTLED_NS:
             return
         seen = [*_seen(prepared), before][-_MOST_SEEN:]
-        with contextlib.suppress(OSError):
-            descriptor, partial = tempfile.mkstemp(prefix=SEEN_FILE, dir=prepared.folder)
-            with os.fdopen(descriptor, "wb") as stream:
-                stream.write(msgspec.json.encode(seen))
-            Path(partial).replace(prepared.folder / SEEN_FILE)
+        with contextlib.suppress(SinkError):
+            write_whole(prepared.folder / SEEN_FILE, msgspec.json.encode(seen))
 
     def new_folder(self) -> Path | None:
         """Return a folder to write an entry's files to; None where none can be made."""

@@ -55,7 +55,7 @@ class Head(ABC):
     score_names: ClassVar[tuple[str, ...]]
     # Whether the joint scope has one score for all six degrees of freedom, not six to compare.
     one_joint_score: ClassVar[bool] = False
-    # For reports: what the set of the method holds.
+    # For reports: what a set of the joint scope is made of.
     set_kind: ClassVar[str] = "each degree of freedom"
     # For reports: why a threshold can be unbounded although there are enough calibration frames.
     infinite_score: ClassVar[str] = "too many calibration truths have an infinite score"

@@ -61,7 +61,7 @@ class McqrHead(Head):
     parameters_type = McqrParameters
     score_names = ("normalised", "additive")
     one_joint_score = True
-    set_kind = "all six at once, a region"
+    set_kind = "six at once, a region"
     parameters: McqrParameters
 
     def __init__(self, parameters: McqrParameters, score: str) -> None:

@@ -447,7 +447,8 @@ def compare(
     dataset: DatasetArgument,
     out: Annotated[Path, typer.Argument(help="New folder, or that of an interrupted comparison.")],
     methods: Annotated[
-        str | None, typer.Option(help="Names with commas; default: all methods and baselines.")
+        str | None,
+        typer.Option(help="Names separated by commas; default: all methods and baselines."),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0.")] = 3,
     split: TrainingSplitOption = None,
@@ -458,41 +459,42 @@ def compare(
     steps: StepsOption = None,
     copies: CopiesOption = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Concurrent runs; default: one a core.")
+        int | None, typer.Option(min=1, help="Parallel runs; default: one per allowed core.")
     ] = None,
     cache: Annotated[Path | None, typer.Option(help="Folder of features; default: in OUT.")] = None,
 ) -> None:
     """Train, publish and evaluate methods and baselines over seeds, and time their frames.
 
-    Repeat the command to resume. OUT gets compare.json and the table compare.txt.
+    A study of one grid. Repeat the command to resume. OUT gets results.json and the table
+    compare.txt.
     """
+    from cvo_edge.engine.cores import allowed_cores
     from cvo_export.networks.methods import TRAINABLE
+    from cvo_export.study.cells import CellFolder
     from cvo_export.study.compare import compare as compare_methods
+    from cvo_export.study.grid import Grid
+    from cvo_export.study.workers import run_tasks
 
-    _open(dataset)
-    options = {
-        "dataset": dataset,
-        "split": split,
-        "size": "256x192",
-        "crop": "none",
-        "backbone": backbone,
-        "weights": weights,
-        "stages": stages,
-        "grid": grid,
-        "normalisation": None,
-        "steps": steps,
-        "copies": copies,
-    }
+    preset = Grid(
+        name="compare",
+        data=[dataset],
+        methods=list(TRAINABLE) if methods is None else methods.split(","),
+        split=split,
+        backbones=[backbone],
+        weights=weights,
+        seeds=seeds,
+        stages=stages,
+        grid=grid,
+        copies=copies,
+        steps=steps,
+    )
     with show_progress() as progress:
         lines = compare_methods(
-            out,
-            options,
-            list(TRAINABLE) if methods is None else methods.split(","),
-            seeds,
-            jobs=jobs,
-            cache=cache,
-            progress=progress,
-            say=partial(print, file=sys.stderr, flush=True),
+            preset,
+            CellFolder.in_folder(out, cache),
+            partial(run_tasks, jobs or allowed_cores()),
+            progress,
+            partial(print, file=sys.stderr, flush=True),
         )
     print(*lines, sep="\n")
 
@@ -500,12 +502,13 @@ def compare(
 @app.command()
 def study(
     config: Annotated[Path, typer.Argument(help="Grids to run, TOML.", show_default=False)],
-    out: Annotated[Path, typer.Argument(help="New folder, or that of an interrupted study.")],
+    out: Annotated[Path, typer.Argument(help="New folder, or that of a study to go on with.")],
     engine: Annotated[
         StudyEngine, typer.Option(help="Processes of this machine, or a Ray cluster.")
     ] = "local",
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Engine local: concurrent runs; default: one a core.")
+        int | None,
+        typer.Option(min=1, help="Engine local: parallel runs; default: one per allowed core."),
     ] = None,
     cache: Annotated[Path | None, typer.Option(help="Folder of features; default: in OUT.")] = None,
 ) -> None:
@@ -521,13 +524,13 @@ def study(
     from cvo_export.study.workers import run_tasks
 
     if engine == "ray" and jobs is not None:
-        raise UsageError("--jobs: expected only with the engine local, found the engine ray")
-    # Fail now rather than after hours if the page cannot be written.
+        raise UsageError("--jobs belongs to --engine local; Ray runs one cell on each of its cores")
+    # Fail now rather than after hours of training if the page cannot be written.
     template = page_template()
     grids = read_study(config)
     local = nullcontext(partial(run_tasks, jobs or allowed_cores()))
     with local if engine == "local" else ray_engine() as run, show_progress() as progress:
-        folder = CellFolder(out.resolve(), (cache or out / "features").resolve())
+        folder = CellFolder.in_folder(out, cache)
         say = partial(print, file=sys.stderr, flush=True)
         results = run_study(grids, folder, run, progress, say)
     print(write_report(results, folder, template))

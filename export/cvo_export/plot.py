@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Calibration
-from cvo_edge.errors import SinkError, SourceError, UsageError
+from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
+from cvo_edge.files import whole_file
 from cvo_edge.input.frame import Frame
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import Chart
@@ -78,13 +79,8 @@ def plot(
         f"{confidence:g} {scope}, {len(drawn.rows)} frames of {dataset.name}"
         + (f", {sequence}" if sequence else "")
     )
-    partial = out.with_name(f".partial-{out.name}")
-    try:
-        figure.savefig(partial, dpi=_DPI)
-        partial.replace(out)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise SinkError(f"{out}: cannot be written: {error.strerror}") from None
+    with whole_file(out) as stream:
+        figure.savefig(stream, format=out.suffix[1:], dpi=_DPI)
 
 
 class Track(NamedTuple):

@@ -2,19 +2,24 @@
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from cvo_edge.errors import CvoError, SinkError, UsageError
+from cvo_edge.errors import SinkError, UsageError
 from cvo_export.cli import app
 from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.networks.backbone import Backbone, BackboneConfig
+from cvo_export.networks.methods import TRAINABLE
 from cvo_export.study import cells, frame_times
+from cvo_export.study.cells import CellFolder
 from cvo_export.study.compare import compare
+from cvo_export.study.grid import Grid
+from cvo_export.study.workers import run_tasks
 from cvo_export.training.run import load_run
 
 from .conftest import DATASET, ignore_progress
@@ -24,32 +29,31 @@ METHODS = ["split", "gaussian"]
 
 @pytest.fixture(scope="module")
 def options(tmp_path_factory):
-    """Arguments of ``configure``; weights of a file, as only features of such are shared."""
+    """Options of the grid; the weights are a file, as random ones share no features."""
     path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
     torch.manual_seed(5)
     body = Backbone(BackboneConfig(stages=("8",), grid=(3, 4)), 48, 64).body
     save_file(body.state_dict(), path)
     return {
-        "dataset": DATASET,
+        "data": [DATASET],
+        "methods": METHODS,
+        "seeds": 2,
         "split": "random",
         "size": "64x48",
-        "crop": "none",
-        "backbone": "mobilenetv2_100",
         "weights": str(path),
         "stages": "8",
-        "grid": "3x4",
-        "normalisation": None,
         "copies": 1,
         "steps": 100,
     }
 
 
-def compared_again(out, options, **changes):
+def compared_again(out, options, jobs=1, **changes):
     said = []
-    values = {"jobs": 1, "cache": None, "progress": ignore_progress, "say": said.append}
-    methods, seeds = changes.pop("methods", METHODS), changes.pop("seeds", 2)
-    lines = compare(out, options, methods, seeds, **{**values, **changes})
-    return lines, said
+    grid = Grid(name="compare", **{**options, **changes})
+    folder = CellFolder.in_folder(out, None)
+    lines = compare(grid, folder, partial(run_tasks, jobs), ignore_progress, said.append)
+    # The first line is about the data set.
+    return lines, said[1:]
 
 
 @pytest.fixture(scope="module")
@@ -67,16 +71,31 @@ def copied(compared, tmp_path):
     return shutil.copytree(compared[0], tmp_path / "out")
 
 
+def path_of(out, name):
+    """The file of the cell METHOD-SEED."""
+    (found,) = (out / "cells").glob(f"*-{name}-????????.json")
+    return found
+
+
 def cell(out, name):
-    return json.loads((out / "cells" / f"{name}.json").read_text())
+    return json.loads(path_of(out, name).read_text())
+
+
+def cells_of(out):
+    return sorted((out / "cells").iterdir())
+
+
+def short(text):
+    """METHOD-SEED at the end of a cell's name, before its digest."""
+    return "-".join(text.split(":")[0].split("-")[-3:-1])
 
 
 def test_every_cell_is_run_once_and_said(compared):
     out, _, (first, second) = compared
     names = [f"{method}-{seed}" for method in METHODS for seed in (0, 1)]
-    assert sorted(path.stem for path in (out / "cells").iterdir()) == sorted(names)
-    assert [line.split(":")[0] for line in first] == ["split-0", "gaussian-0"]
-    assert sorted(line.split(":")[0] for line in second) == ["gaussian-1", "split-1"]
+    assert sorted(short(path.stem) for path in (out / "cells").iterdir()) == sorted(names)
+    assert [short(line) for line in first] == ["split-0", "gaussian-0"]
+    assert sorted(short(line) for line in second) == ["gaussian-1", "split-1"]
     assert all(line.endswith(f"({i} of 2)") for i, line in enumerate(first, 1))
     # One folder of features a seed, none in a run.
     assert len(list((out / "features").iterdir())) == 2
@@ -85,7 +104,8 @@ def test_every_cell_is_run_once_and_said(compared):
 
 def test_a_cell_holds_what_evaluate_says_of_its_bundle(compared):
     out, _, _ = compared
-    report = evaluate(out / "bundles" / "gaussian-1", open_dataset(DATASET), "test")
+    name = path_of(out, "gaussian-1").stem
+    report = evaluate(out / "bundles" / name, open_dataset(DATASET), "test")
     marginal = find_level(report["levels"], 0.9, "marginal")
     joint = find_level(report["levels"], 0.9, "joint")
     found = cell(out, "gaussian-1")
@@ -102,11 +122,11 @@ def test_a_cell_holds_what_evaluate_says_of_its_bundle(compared):
     assert found["point_error"] == report["point_error"]
     assert cell(out, "split-1")["own"] is None
     assert found["training"]["processor"] > 0
-    graph = load_run(out / "runs" / "gaussian-1").graph
+    graph = load_run(out / "runs" / name).graph
     assert found["graph_parameters"] == sum(p.numel() for p in graph.parameters())
     behind = found["graph_parameters"] - found["head_parameters"]
     assert behind == sum(p.numel() for p in graph.backbone.parameters())
-    model = out / "bundles" / "gaussian-1" / "model.onnx"
+    model = out / "bundles" / name / "model.onnx"
     assert found["model_bytes"] == model.stat().st_size
 
 
@@ -124,19 +144,17 @@ def test_the_table_has_a_row_for_every_kind_of_set(compared):
     assert len({row.index(") ") for row in rows}) == 1
 
 
-def test_the_report_holds_every_figure_and_no_path(compared, options):
+def test_the_results_are_those_of_a_study(compared):
     out, _, _ = compared
-    text = (out / "compare.json").read_text()
-    report = json.loads(text)
-    names = [f"{method}-{seed}" for method in METHODS for seed in (0, 1)]
-    assert report["cells"] == [cell(out, name) for name in names]
-    assert report["timing"] == json.loads((out / "timing.json").read_text())
-    assert set(report["timing"]["ms"]) == set(METHODS)
-    assert report["options"]["steps"] == 100
-    assert report["heads"]["gaussian"]["method"] == "gaussian"
-    assert report["timing"]["environment"]["cores_allowed"] >= 1
-    assert options["weights"] not in text
-    assert str(out.parent) not in text
+    report = json.loads((out / "results.json").read_text())
+    assert report["cells"] == {path.stem: json.loads(path.read_text()) for path in cells_of(out)}
+    assert report["timing"] == {"compare": json.loads((out / "timing-compare.json").read_text())}
+    timed = [path_of(out, f"{method}-0").stem for method in METHODS]
+    assert set(report["timing"]["compare"]["ms"]) == set(timed)
+    assert report["timing"]["compare"]["environment"]["cores_allowed"] >= 1
+    (grid,) = report["study"]["grids"]
+    assert grid["steps"] == 100
+    assert str(out.parent) not in (out / "results.json").read_text()
 
 
 def test_a_finished_comparison_trains_and_times_nothing(copied, compared, options, monkeypatch):
@@ -152,47 +170,78 @@ def test_a_finished_comparison_trains_and_times_nothing(copied, compared, option
 
 def test_a_cell_that_is_gone_is_made_again_with_the_same_figures(copied, options):
     before = cell(copied, "gaussian-1")
-    (copied / "cells" / "gaussian-1.json").unlink()
-    shutil.rmtree(copied / "runs" / "gaussian-1")
+    path = path_of(copied, "gaussian-1")
+    path.unlink()
+    shutil.rmtree(copied / "runs" / path.stem)
     _, said = compared_again(copied, options)
-    assert [line.split(":")[0] for line in said] == ["gaussian-1"]
+    assert [short(line) for line in said] == ["gaussian-1"]
     after = cell(copied, "gaussian-1")
     assert {**after, "training": None} == {**before, "training": None}
 
 
 def test_a_failed_cell_is_named_and_the_others_are_run(copied, options):
-    for method in METHODS:
-        (copied / "cells" / f"{method}-0.json").unlink()
-    (copied / "bundles" / "split-0" / "precious.txt").write_text("keep")
-    said = []
-    with pytest.raises(SinkError, match="expected 2 more cells, found 1; failed: split-0"):
-        compared_again(copied, options, say=said.append)
-    assert said[0].startswith("split-0: failed: ")
-    assert said[1].startswith("gaussian-0: score ")
-    # Its training was there already, so that this time nobody has measured it.
+    split, gaussian = (path_of(copied, f"{method}-0") for method in METHODS)
+    split.unlink()
+    gaussian.unlink()
+    (copied / "bundles" / split.stem / "precious.txt").write_text("keep")
+    with pytest.raises(SinkError, match=rf"1 of 2 cells failed \({split.stem}\); the same command"):
+        compared_again(copied, options)
+    # The run was complete already, so its training time is not known.
     assert cell(copied, "gaussian-0")["training"] is None
-    assert not (copied / "cells" / "split-0.json").exists()
+    assert not split.exists()
 
 
 def test_cells_of_other_options_are_refused_by_name(copied, options):
-    with pytest.raises(UsageError, match="others: gaussian-0, gaussian-1, split-0, split-1"):
-        compared_again(copied, {**options, "steps": 101})
-    other = cell(copied, "split-0")
-    path = copied / "cells" / "split-0.json"
-    path.write_text(json.dumps({**other, "options": "0" * 64}))
-    with pytest.raises(UsageError, match=r"found others: split-0$"):
+    names = ", ".join(path.stem for path in cells_of(copied))
+    with pytest.raises(UsageError, match=rf"cells of other options \({names}\); name a new folder"):
+        compared_again(copied, options, steps=101)
+    path = path_of(copied, "split-0")
+    other = path.rename(path.with_stem(path.stem[:-8] + "0" * 8))
+    with pytest.raises(UsageError, match=rf"options \({other.stem}\); name"):
         compared_again(copied, options, methods=["gaussian"])
-    path.write_text(json.dumps({**other, "more": 1}))
+    other.write_text(json.dumps({**json.loads(other.read_text()), "more": 1}))
     with pytest.raises(UsageError, match="expected the figures of a cell"):
         compared_again(copied, options)
 
 
-def test_an_unknown_method_is_refused_before_anything(tmp_path):
+def test_a_folder_of_an_earlier_version_is_refused(tmp_path, options):
+    (tmp_path / "cells").mkdir()
+    for name in ("mc-dropout-10", "cjp-0"):
+        (tmp_path / "cells" / f"{name}.json").write_text("{}")
+    found = r"cells of an earlier version \(cjp-0, mc-dropout-10\); name a new folder"
+    with pytest.raises(UsageError, match=found):
+        compared_again(tmp_path, options)
+
+
+@pytest.mark.parametrize(
+    ("methods", "message"),
+    [
+        ("split,other", r"method: expected one of cjp, .*split, found other"),
+        ("split,split", "methods: expected each value once"),
+    ],
+)
+def test_methods_that_cannot_be_compared_are_refused_before_anything(methods, message, tmp_path):
     command = ["compare", DATASET, str(tmp_path / "out"), "--weights", "none"]
-    with pytest.raises(CvoError, match=r"expected one of cjp, .*split, found other") as caught:
-        app([*command, "--methods", "split,other"], standalone_mode=False)
+    with pytest.raises(UsageError, match=message) as caught:
+        app([*command, "--methods", methods], standalone_mode=False)
     assert caught.value.exit_code == 2
     assert not (tmp_path / "out").exists()
+
+
+def test_the_command_compares_everything_by_default(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def compare(grid, folder, *_):
+        asked.append((grid, folder))
+        return ["the table"]
+
+    monkeypatch.setattr("cvo_export.study.compare.compare", compare)
+    app(["compare", DATASET, str(tmp_path / "out"), "--split", "random"], standalone_mode=False)
+    ((grid, folder),) = asked
+    assert grid.methods == list(TRAINABLE)
+    assert (grid.data, grid.split, grid.seeds, grid.steps) == ([DATASET], "random", 3, None)
+    assert folder.features == tmp_path / "out" / "features"
+    assert capsys.readouterr().out == "the table\n"
 
 
 def test_a_folder_that_cannot_be_one_is_refused(tmp_path, options):
@@ -202,14 +251,15 @@ def test_a_folder_that_cannot_be_one_is_refused(tmp_path, options):
 
 
 def test_bundles_are_timed_again_when_one_has_changed(copied, options, monkeypatch):
-    path = copied / "timing.json"
+    path = copied / "timing-compare.json"
     timing = json.loads(path.read_text())
-    timing["bundles"]["split"] = "0" * 64
+    split = path_of(copied, "split-0").stem
+    timing["bundles"][split] = "0" * 64
     path.write_text(json.dumps(timing))
     timed = []
 
     def frame_ms(bundles, dataset):
-        timed.append(sorted(folder.name for folder in bundles.values()))
+        timed.append(sorted(short(folder.name) for folder in bundles.values()))
         return {method: {"p50": 1.25, "p95": 2.5} for method in bundles}
 
     monkeypatch.setattr(frame_times, "frame_ms", frame_ms)
@@ -218,4 +268,4 @@ def test_bundles_are_timed_again_when_one_has_changed(copied, options, monkeypat
         assert sum("1.25 (2.50)" in line for line in lines) == 2
     compared_again(copied, options, methods=["gaussian"])
     assert timed == [["gaussian-0", "split-0"]]
-    assert json.loads(path.read_text())["bundles"]["split"] == cell(copied, "split-0")["bundle"]
+    assert json.loads(path.read_text())["bundles"][split] == cell(copied, "split-0")["bundle"]

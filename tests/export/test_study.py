@@ -16,7 +16,7 @@ from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.study import cells
 from cvo_export.study.cells import CellFolder
-from cvo_export.study.grid import _plan, expanded, read_study, run_study
+from cvo_export.study.grid import expanded, plan_study, read_study, run_study
 from cvo_export.study.report import page_template, write_report
 from cvo_export.study.workers import run_tasks
 
@@ -117,7 +117,7 @@ def test_a_folder_is_filled_by_one_program_at_a_time(studied, monkeypatch):
     monkeypatch.setenv("CVO_TEST_DATA", DATASET)
     with (folder.out / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(UsageError, match="found one in use"):
+        with pytest.raises(UsageError, match="another program is running cells"):
             run_study(study, folder, engine, ignore_progress, [].append)
 
 
@@ -198,23 +198,26 @@ def test_names_of_cells_depend_on_no_place(studied, monkeypatch, tmp_path):
     [
         ("title = 1", "expected a study"),
         (CONFIG.replace("steps", "stepz"), "unknown field `stepz`"),
-        (CONFIG.replace('"sharpness"', '"METHODS"'), "a name of its own for every grid"),
+        (CONFIG.replace('"sharpness"', '"METHODS"'), "names of grids that differ"),
         (CONFIG.replace("sharpness = [0.5", "stages = [4"), "stages: expected text, found 4"),
         (CONFIG.replace("sharpness = [0.5, 1.0]", "grid = [3]"), "grid: expected text, found 3"),
         (CONFIG.replace("sharpness = [0.5", 'share = ["half"'), "share: expected above 0"),
         (CONFIG.replace("sharpness = [0.5", "share = [0.0"), "share: expected above 0"),
         (CONFIG.replace("sharpness = [0.5", "share = [nan"), "share: expected above 0"),
-        (CONFIG.replace("sharpness = [0.5, 1.0]", "share = [1, 1.0]"), "share: expected each once"),
+        (
+            CONFIG.replace("sharpness = [0.5, 1.0]", "share = [1, 1.0]"),
+            "share: expected each value",
+        ),
         (CONFIG.replace("sharpness = [0.5", "kl_weight = [inf"), "expected a finite number"),
         (CONFIG.replace("sharpness = [0.5", "dropout = [2.0"), "grid sharpness: .*dropout"),
-        (CONFIG.replace('["cjp"]', '["cjp", "cjp"]'), "methods: expected each once"),
+        (CONFIG.replace('["cjp"]', '["cjp", "cjp"]'), "methods: expected each value once"),
         (CONFIG.replace('"none"', '"/nowhere.safetensors"'), "expected a safetensors file"),
         (CONFIG.replace("copies", 'backbones = ["a/b"]\ncopies'), "expected a model of timm"),
         (CONFIG.replace("$CVO_TEST_DATA", DATASET.split(",")[0] + ",flights=1,frames=20"), "val"),
         (CONFIG.replace("speckle:0.3", "rain"), "expected NAME or NAME:STRENGTH"),
         (CONFIG.replace('["cjp"]', '["abc"]'), "expected one of cjp"),
         (CONFIG.replace("sharpness = [0.5", "classes = [4"), "--classes is not an option of cjp"),
-        (CONFIG.replace("CVO_TEST_DATA", "CVO_UNSET"), "CVO_UNSET to be set"),
+        (CONFIG.replace("CVO_TEST_DATA", "CVO_UNSET"), "variable CVO_UNSET is not set"),
         ("grids = [", "expected a study"),
     ],
 )
@@ -252,19 +255,16 @@ def test_two_data_sets_of_one_name_are_told_apart(monkeypatch, tmp_path):
 
 
 def planned(text, folder, monkeypatch):
-    """Results of a study whose cells are not there: places and labels alone."""
+    """The plan of a study that has not been run."""
     monkeypatch.setenv("CVO_TEST_DATA", DATASET)
     (folder / "study.toml").write_text(text)
-    study = read_study(folder / "study.toml")
-    opened = {text: open_dataset(expanded(text)) for grid in study.grids for text in grid.data}
-    plan = _plan(study, opened)
-    return study, plan
+    return plan_study(read_study(folder / "study.toml"))
 
 
 def test_labels_tell_data_sets_of_one_name_apart(monkeypatch, tmp_path):
     other = f"{DATASET},seed=1"
     text = CONFIG.replace('data = ["$CVO_TEST_DATA"]', f'data = ["$CVO_TEST_DATA", "{other}"]')
-    _, plan = planned(text, tmp_path, monkeypatch)
+    plan = planned(text, tmp_path, monkeypatch)
     name = open_dataset(DATASET).name
     assert plan.labels == {
         "$CVO_TEST_DATA": f"{name} ($CVO_TEST_DATA)",
@@ -305,5 +305,5 @@ def test_the_configurations_that_come_with_the_project_can_be(name, cells, reque
     study = read_study(request.config.rootpath / "bench" / "study" / f"{name}.toml")
     stand_in = open_dataset("synthetic:room,flights=20,frames=10,size=64x48")
     monkeypatch.setattr("cvo_export.training.configure.open_dataset", lambda _: stand_in)
-    opened = {text: stand_in for grid in study.grids for text in grid.data}
-    assert len(_plan(study, opened).configs) == cells
+    monkeypatch.setattr("cvo_export.study.grid.open_dataset", lambda _: stand_in)
+    assert len(plan_study(study).configs) == cells

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from cvo_edge.heads import HEADS
 from cvo_export.bundles.figures import adaptiveness
-from cvo_export.study.cells import Cell, CellFolder, Figures, NoiseFigures, Seconds, Width
+from cvo_export.networks.methods import TRAINABLE
+from cvo_export.study import tables
+from cvo_export.study.cell import Cell, Figures, NoiseFigures, Seconds, Width
+from cvo_export.study.cells import CellFolder
 from cvo_export.study.grid import Grid, Place, Results, Study
-from cvo_export.study.report import _Report
+from cvo_export.study.report import _Report, tube_method
 
 DATA = "somewhere"
 
@@ -54,7 +59,8 @@ def cell(method: str, seed: int, score: float, own: float | None = None, **noise
 class Fabricated:
     """Results whose cells are made up: a score for each place."""
 
-    def __init__(self) -> None:
+    def __init__(self, methods=("cjp", "csp")) -> None:
+        self.methods = methods
         self.grids: list[Grid] = []
         self.places: list[Place] = []
         self.cells: dict[str, Cell] = {}
@@ -66,7 +72,7 @@ class Fabricated:
             name=name,
             data=[DATA],
             split=split,
-            methods=["cjp", "csp"],
+            methods=list(self.methods),
             backbones=list(backbones),
             vary=vary,
             **options,
@@ -97,15 +103,15 @@ def test_a_table_shows_medians_under_their_heads():
     grid = made.add(
         "methods", lambda p: cell(p.method, p.seed, scores.get((p.method, p.seed), 7.0), 0.3)
     )
-    row = rows_of(made.report().figures_table("", made.places, ()))["net", "cjp"]
+    row = rows_of(made.report().tables.figures_table("", made.places, ()))["net", "cjp"]
     assert row["score"] == "0.200 (0.100, 0.400, 0.200)"
     assert row["coverage"] == "0.900"
-    assert row["mean width"] == "1.0 cm 1.00 deg"
+    assert row["mean width"] == "1.00 cm 1.00 deg"
     assert row["volume^1/6"] == "0.500"
     assert (row["own coverage"], row["own mean width"], row["own score"]) == (
         "0.300",
-        "2.0 cm 1.00 deg",
-        "3.000",
+        "2.00 cm 1.00 deg",
+        "3.000 (3.000, 3.000, 3.000)",
     )
     assert (row["width ratio"], row["rank corr."]) == ("1.50", "0.25")
     assert (row["M param."], row["MiB"], row["train s"]) == ("2.00", "3.0", "60")
@@ -129,7 +135,7 @@ def test_noise_of_another_grid_is_not_shown_and_refused_frames_are():
         noises=["speckle:0.3", "exposure:-8"],
         seeds=2,
     )
-    table = made.report().noise_table("", made.places, grid)
+    table = made.report().tables.noise_table("", made.places, grid)
     names = [row[2] for row in table.rows]
     assert names == ["none", "speckle:0.3", "exposure:-8.0"] * 2
     row = dict(zip(table.head, table.rows[1], strict=True))
@@ -139,11 +145,12 @@ def test_noise_of_another_grid_is_not_shown_and_refused_frames_are():
         "5.000 (5.000, 5.000)",
         "6.000 (6.000, 6.000)",
     ]
-    assert table.rows[2][3] == "all of a seed's frames"
+    assert table.rows[2][3] == "all frames of a seed"
     assert {len(row) for row in table.rows} == {len(table.head)}
 
 
-def test_table_one_compares_like_with_like():
+def test_table_one_compares_like_with_like(monkeypatch):
+    monkeypatch.setattr(tables, "read_calibration", lambda _: SimpleNamespace(method="cqr"))
     made = Fabricated()
     main = made.add("methods", lambda p: cell(p.method, p.seed, 1.0), backbones=("net", "other"))
     share = {"share": [0.5, 1.0]}
@@ -168,15 +175,46 @@ def test_table_one_compares_like_with_like():
         seeds=1,
     )
     made.places = [p for p in made.places if p.grid != "lambda" or p.method == "cjp"]
-    table = made.report().table_one(main)
+    table = made.report().tables.table_one(main)
     rows = {row[0]: row[1:] for row in table.rows}
     assert table.head == ["", "cjp", "csp"]
-    assert rows["data dependency: score at 50 % of the frames"] == ["0.500 (one seed)"] * 2
-    assert rows["data dependency: score at 100 % of the frames"] == ["1.000 (one seed)"] * 2
+    assert (
+        rows["data dependency: score with a share of 0.5 of the frames"] == ["0.500 (one seed)"] * 2
+    )
+    assert (
+        rows["data dependency: score with a share of 1 of the frames"] == ["1.000 (one seed)"] * 2
+    )
     assert rows["interval calibration: own coverage at lambda 0"] == ["0.000 (one seed)", "-"]
     assert rows["interval calibration: own coverage at lambda 1"] == ["0.500 (one seed)", "-"]
     assert rows["disjoint bands: share of sets in pieces"] == ["none", "4.0 %"]
     assert rows["complexity: MiB of the model"] == ["3.0", "3.0"]
+
+
+@pytest.mark.parametrize(
+    ("jointly", "sets"), [(True, "six at once, a region"), (False, "each degree of freedom")]
+)
+def test_a_method_that_is_registered_elsewhere_needs_no_change_here(jointly, sets, monkeypatch):
+    monkeypatch.setitem(TRAINABLE, "toy", SimpleNamespace(config=lambda: SimpleNamespace(knob=1)))
+    monkeypatch.setitem(HEADS, "toy", SimpleNamespace(one_joint_score=jointly))
+    monkeypatch.setattr(tables, "read_calibration", lambda _: SimpleNamespace(method="toy"))
+    made = Fabricated(methods=["toy"])
+    main = made.add("methods", lambda p: cell("toy", p.seed, 1.0))
+    vary = {"share": [0.5, 1.0], "knob": [1, 2]}
+    made.add("less", lambda p: cell("toy", 0, p.varied["share"] * p.varied["knob"]), vary=vary)
+    table = made.report().tables.table_one(main)
+    assert table.head == ["", "toy"]
+    rows = {row[0]: row[1] for row in table.rows}
+    assert rows["uncertainty bands: the network's sets"] == sets
+    assert rows["data dependency: score with a share of 0.5 of the frames"] == "0.500"
+
+
+def test_the_tube_is_of_the_first_method_whose_sets_are_bounded():
+    def drawn(reach):
+        estimates = [SimpleNamespace(lower=np.full(6, -reach), upper=np.full(6, reach))]
+        return SimpleNamespace(estimates=estimates, rows=[0])
+
+    assert tube_method({"wide": drawn(np.inf), "toy": drawn(1.0), "next": drawn(1.0)}) == "toy"
+    assert tube_method({"wide": drawn(np.inf), "wider": drawn(np.inf)}) == "wide"
 
 
 def test_lines_of_a_curve_are_of_one_backbone_and_one_of_all_else():

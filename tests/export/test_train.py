@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from cvo_edge.errors import UsageError
+from cvo_edge.errors import SinkError, UsageError
 from cvo_export.networks.standardised import MAX_SPREAD_RAD, fit_target
+from cvo_export.training import features
 from cvo_export.training import loop as training
 from cvo_export.training.features import ModelImages
 from cvo_export.training.loop import train
@@ -73,6 +74,31 @@ def test_fine_tuning_is_resumable_and_changes_the_backbone(tmp_path):
 def test_a_run_folder_of_other_options_is_refused(tiny_run, run_dir):
     with pytest.raises(UsageError, match="found another run"):
         train(run_dir, tiny_config(seed=1), ignore_progress)
+
+
+def test_a_full_disk_is_one_line_and_the_run_resumes(tiny_run, tmp_path, files_limited):
+    folder = tmp_path / "run"
+    for limit, file in [
+        (100, "split.json"),
+        (100_000, r"features-0/\S*.npz"),
+        (2_000_000, "checkpoint-cjp.pt"),
+    ]:
+        full = pytest.raises(SinkError, match=rf"{file}: cannot be written: File too large$")
+        with files_limited(limit), full:
+            train(folder, tiny_config(), ignore_progress)
+        assert not list(folder.rglob("*.partial"))
+    assert same_weights(tiny_run, train(folder, tiny_config(), ignore_progress))
+    (folder / "network.pt").unlink()
+    full = pytest.raises(SinkError, match=r"network.pt: cannot be written: File too large$")
+    with files_limited(100_000), full:
+        train(folder, tiny_config(), ignore_progress)
+    assert not list(folder.rglob("*.partial"))
+
+
+def test_arrays_are_stored_under_their_own_names_alone(tmp_path):
+    features._store(tmp_path / "new" / "a.npz", {"poses": np.zeros((2, 7))})
+    with np.load(tmp_path / "new" / "a.npz") as stored:
+        assert stored.files == ["poses"]
 
 
 def test_a_finished_run_is_read_back(tiny_run, run_dir):

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import SplitSpec
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.files import write_whole
 from cvo_edge.vocabulary import SplitKind
 from cvo_export.datasets import PoseDataset
 
@@ -66,12 +67,12 @@ class Split:
         )
 
     def write(self, path: Path, dataset: PoseDataset) -> None:
-        """Write kind, seed and the frame names of every role as JSON."""
+        """Write kind, seed and the frame names of every role as JSON; raises SinkError."""
         document = {
             **msgspec.to_builtins(self.spec(dataset)),
             "roles": self._names(dataset),
         }
-        path.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+        write_whole(path, json.dumps(document, indent=1) + "\n")
 
     def _names(self, dataset: PoseDataset) -> dict[str, list[str]]:
         return {

@@ -1,7 +1,7 @@
-"""Cells of a comparison or a study: a run each, trained, calibrated and evaluated once.
+"""The cells of a study: one run each, trained, calibrated and evaluated once.
 
-A finished cell is a file and never run again; an interrupted one goes on from its own checkpoints.
-Cells run beside each other, torch with one thread in each.
+A finished cell is a file and is not run again; an interrupted one resumes from its checkpoints.
+Cells run in parallel, each with one thread of torch.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Struct
 from torch import nn
 
 from cvo_edge.bundle.reading import read_calibration
@@ -30,111 +29,25 @@ from cvo_export.evaluate import evaluate, find_level
 from cvo_export.files import read_json, write_json
 from cvo_export.progress import Progress, Stage
 from cvo_export.publish import publish
+from cvo_export.study.cell import CONFIDENCE, Cell, Figures, NoiseFigures, Seconds
 from cvo_export.study.workers import Engine
 from cvo_export.training.loop import prepare_features, train
 from cvo_export.training.run import TrainConfig
 
-CONFIDENCE = 0.9
-
 Say = Callable[[str], None]
-
-
-class Width(Struct, frozen=True, forbid_unknown_fields=True):
-    """Means over three degrees of freedom each: metres, and degrees."""
-
-    m: float
-    deg: float
-
-
-class Figures(Struct, frozen=True, forbid_unknown_fields=True):
-    """Sets of 90 % on the test frames; coverage per DoF, their mean, and of all six at once.
-
-    Widths and score take an unbounded side to end where the workspace does; ``unbounded`` is the
-    share of frames that have one, None for bounds that always are finite.
-    """
-
-    coverage: list[float]
-    mean_coverage: float
-    joint_coverage: float
-    mean_width: Width
-    median_width: Width
-    normalised_interval_score: float
-    unbounded: float | None
-
-
-class NoiseFigures(Struct, frozen=True, forbid_unknown_fields=True):
-    """Marginal sets on test frames with noise: by thresholds of clean frames, and of noisy ones.
-
-    Of the frames that passed the checks; ``invalid`` did not.
-    """
-
-    invalid: int
-    point_error: dict[str, float]
-    clean: Figures
-    recalibrated: Figures
-
-
-class Seconds(Struct, frozen=True, forbid_unknown_fields=True):
-    """What training took, without features of the network as it was in the beginning."""
-
-    processor: float
-    wall: float
-
-
-class Cell(Struct, frozen=True, forbid_unknown_fields=True):
-    """Figures of one run.
-
-    Attributes
-    ----------
-    options
-        Digest of the run's configuration.
-    bundle
-        Digest of its bundle.
-    marginal, joint, own
-        Calibrated sets of both scopes; the network's own bounds before, where it gives some.
-    joint_volume
-        Of the joint sets, in standardised units.
-    training
-        None for a run that was interrupted: then nobody has measured it.
-    head_parameters, graph_parameters
-        Trained behind the features, and in all; what a forest holds is no parameter.
-    model_bytes
-        Of the ONNX file, with everything.
-    adaptiveness
-        How far widths follow errors, of the marginal sets; see ``cvo_export.evaluate``.
-    pieces
-        Share of the marginal sets that are in pieces; None where a method has none.
-    noise
-        Figures on test frames with noise, by its name and strength; None where no frame passed the
-        checks.
-    """
-
-    method: str
-    seed: int
-    options: str
-    bundle: str
-    score: str
-    frames: dict[str, int]
-    marginal: Figures
-    joint: Figures
-    own: Figures | None
-    joint_volume: dict[str, float]
-    point_error: dict[str, float]
-    training: Seconds | None
-    head_parameters: int
-    graph_parameters: int
-    model_bytes: int
-    adaptiveness: dict[str, float | None]
-    pieces: float | None
-    noise: dict[str, NoiseFigures | None] = {}
 
 
 @dataclass(frozen=True)
 class CellFolder:
-    """Where cells, their runs and their bundles are kept by name, and the features they share."""
+    """Cells, runs and bundles by name, and the features that runs share."""
 
     out: Path
     features: Path
+
+    @classmethod
+    def in_folder(cls, out: Path, features: Path | None) -> CellFolder:
+        """Absolute paths; by default the features are in the folder itself."""
+        return cls(out.resolve(), (features or out / "features").resolve())
 
     def cell(self, name: str) -> Path:
         """File of a cell's figures."""
@@ -149,29 +62,17 @@ class CellFolder:
         return self.out / "bundles" / name
 
     def read(self, name: str) -> Cell:
-        """Figures of a finished cell; raises UsageError where the file holds none."""
+        """Figures of a finished cell; raises UsageError where the file does not hold any."""
         return read_json(self.cell(name), Cell, "the figures of a cell")
 
-    def check(self, config_of: Callable[[Cell, str], TrainConfig | None]) -> None:
-        """Raise UsageError where a cell was made with other options than ``config_of`` it says.
-
-        ``config_of`` gets a cell and its name; None stands for a cell that nobody asked for.
-        """
-        others = []
-        for path in sorted(self.cell("*").parent.glob("*.json")):
-            found = self.read(path.stem)
-            config = config_of(found, path.stem)
-            if config is None or found.options != digest(config):
-                others.append(path.stem)
-        if others:
-            raise UsageError(
-                f"{self.out}: expected cells of the same options, found others: {', '.join(others)}"
-            )
+    def names(self) -> list[str]:
+        """Names of all finished cells."""
+        return sorted(path.stem for path in self.cell("*").parent.glob("*.json"))
 
     def check_data(self, configs: Mapping[str, TrainConfig]) -> None:
         """Raise UsageError where a finished cell is of another data set or other weights.
 
-        Names of cells depend on no place: what is found there now may be something else.
+        A cell's name does not tell: the files behind the same path may have changed.
         """
         opened: dict[str, PoseDataset] = {}
         digests: dict[str, str] = {}
@@ -185,7 +86,8 @@ class CellFolder:
                 same_split(opened[config.dataset], made.calibration.split)
             except (SourceError, UsageError) as error:
                 raise UsageError(
-                    f"{self.cell(name)}: expected a cell of {config.dataset}: {error}"
+                    f"{self.cell(name)}: expected a cell of {config.dataset}: {error}; name a new "
+                    "folder"
                 ) from None
             given = Path(config.weights)
             if made.provenance.weights_sha256 is not None and given.is_file():
@@ -195,7 +97,7 @@ class CellFolder:
                 if found != made.provenance.weights_sha256:
                     raise UsageError(
                         f"{self.cell(name)}: expected a cell of weights {found[:16]}..., found one "
-                        f"of {made.provenance.weights_sha256[:16]}..."
+                        f"of {made.provenance.weights_sha256[:16]}...; name a new folder"
                     )
 
     def fill(
@@ -206,12 +108,12 @@ class CellFolder:
         progress: Progress,
         say: Say,
     ) -> dict[str, Cell]:
-        """Run what is missing; return all cells.
+        """Run the missing cells; return all.
 
-        ``noises`` by name of the cell: it is evaluated on frames with each, too.
+        ``noises`` by name of the cell: the cell is also evaluated on frames with each of them.
 
-        Raises the first failure's kind after all have been tried, SinkError where the folder cannot
-        be written.
+        Raises an error of the first failure's kind once all cells have been tried, SinkError where
+        the folder cannot be written.
         """
         with self._locked():
             missing = {
@@ -255,14 +157,14 @@ class CellFolder:
             if failures:
                 first = next(iter(failures.values()))
                 raise type(first)(
-                    f"{self.out}: expected {len(missing)} more cells, found "
-                    f"{len(missing) - len(failures)}; failed: {', '.join(failures)}"
+                    f"{self.out}: {len(failures)} of {len(missing)} cells failed "
+                    f"({', '.join(failures)}); the same command tries them again"
                 )
             return {name: self.read(name) for name in configs}
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Keep a second program out: both would write the same runs."""
+        """Lock the folder: a second program would write the same runs."""
         try:
             self.out.mkdir(parents=True, exist_ok=True)
             lock = (self.out / ".lock").open("w")
@@ -273,7 +175,8 @@ class CellFolder:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise UsageError(
-                    f"{self.out}: expected a folder that nobody is filling, found one in use"
+                    f"{self.out}: another program is running cells in this folder; wait for it, or "
+                    "name a new folder"
                 ) from None
             yield
 
@@ -286,7 +189,7 @@ def run_cell(
 ) -> None:
     """Train, publish and evaluate one cell, and write its file, whole or not at all.
 
-    One that is there is evaluated with the noises that it has not seen.
+    A finished cell is evaluated with the noises that it lacks.
     """
     if not folder.cell(name).is_file():
         write_json(folder.cell(name), _finished(folder, name, config))
@@ -305,19 +208,19 @@ def _with_noise(bundle: Path, config: TrainConfig, text: str) -> NoiseFigures | 
     try:
         report = evaluate(bundle, dataset, "test", threads=1, noise=parse_noise(text))
     except SourceError:
-        # The same frames without noise have been read: these did not pass the checks, not one.
+        # The clean frames could be read, so not one of the noisy ones passed the checks.
         return None
     again = report["recalibrated"]["levels"]
     return NoiseFigures(
         invalid=_left_out(report),
         point_error=report["point_error"],
-        clean=_figures(find_level(report["levels"], CONFIDENCE, "marginal")),
-        recalibrated=_figures(find_level(again, CONFIDENCE, "marginal")),
+        clean=Figures.of(find_level(report["levels"], CONFIDENCE, "marginal")),
+        recalibrated=Figures.of(find_level(again, CONFIDENCE, "marginal")),
     )
 
 
 def _left_out(report: Mapping[str, Any]) -> int:
-    """Frames that did not pass the checks, whichever."""
+    """Frames that did not pass the checks."""
     frames = report["frames"]
     return int(frames["invalid"] + frames["degraded"])
 
@@ -340,9 +243,9 @@ def _finished(folder: CellFolder, name: str, config: TrainConfig) -> Cell:
         bundle=calibration.digest,
         score=report["score"],
         frames={"total": report["frames"]["total"], "invalid": _left_out(report)},
-        marginal=_figures(marginal),
-        joint=_figures(joint),
-        own=None if report["own"] is None else _figures(report["own"]),
+        marginal=Figures.of(marginal),
+        joint=Figures.of(joint),
+        own=None if report["own"] is None else Figures.of(report["own"]),
         joint_volume=joint["joint_volume"],
         point_error=report["point_error"],
         training=None if interrupted else seconds,
@@ -365,14 +268,14 @@ def digest(config: TrainConfig) -> str:
 
 
 def _features_of(config: TrainConfig) -> bytes:
-    """What decides the features of a run: all but its method."""
+    """What decides the features of a run: everything but its method."""
     return msgspec.json.encode({**msgspec.to_builtins(config), "head": None, "steps": 0})
 
 
 class _Clock:
-    """Seconds since the first features were there, as training reports them.
+    """Seconds since the first features were complete, as training reports them.
 
-    Those of a backbone that has learnt, of fine-tuning, are made within training and counted.
+    Features of a fine-tuned backbone are part of the training and count.
     """
 
     def __init__(self) -> None:
@@ -388,22 +291,6 @@ class _Clock:
     def seconds(self) -> Seconds:
         processor, wall = self._begin
         return Seconds(round(process_time() - processor, 3), round(perf_counter() - wall, 3))
-
-
-def _figures(level: Mapping[str, Any]) -> Figures:
-    def width(key: str) -> Width:
-        values = np.array(level[key])
-        return Width(float(values[:3].mean()), float(np.rad2deg(values[3:].mean())))
-
-    return Figures(
-        coverage=level["coverage"],
-        mean_coverage=float(np.mean(level["coverage"])),
-        joint_coverage=level["joint_coverage"],
-        mean_width=width("mean_width"),
-        median_width=width("median_width"),
-        normalised_interval_score=level["normalised_interval_score"],
-        unbounded=level.get("unbounded_share"),
-    )
 
 
 def _parameters(module: nn.Module) -> int:

@@ -1,129 +1,73 @@
-"""Methods and baselines beside each other: trained, calibrated, evaluated and timed; one table.
-
-A cell is a method with a seed. A finished one is a file and never run again; an interrupted one
-goes on from its own checkpoints. Cells run beside each other, torch with one thread in each; what
-a frame costs is measured afterwards, alone.
-"""
+"""Methods and baselines side by side: a study of one grid, and its table as text."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
-from itertools import product
-from pathlib import Path
-from typing import Any
+from msgspec.structs import replace
 
-import msgspec
-import numpy as np
-
-from cvo_edge.engine.cores import allowed_cores
-from cvo_export.bundles.draft import versions
-from cvo_export.data.splits import default_kind
-from cvo_export.datasets import open_dataset
-from cvo_export.files import write_json, write_whole
+from cvo_edge.errors import UsageError
+from cvo_edge.files import write_whole
 from cvo_export.networks.baselines import BASELINES
 from cvo_export.networks.methods import TRAINABLE
 from cvo_export.progress import Progress
-from cvo_export.study.cells import CONFIDENCE, Cell, CellFolder, Figures, Say
-from cvo_export.study.frame_times import Timing, timed
-from cvo_export.study.workers import run_tasks
-from cvo_export.training.configure import configure
-from cvo_export.training.run import TrainConfig
+from cvo_export.study.cell import Cell
+from cvo_export.study.cells import CellFolder, Say
+from cvo_export.study.grid import Grid, Results, Study, plan_study, run_study
+from cvo_export.study.summaries import (
+    BLANK,
+    error_shown,
+    joint_shown,
+    own_shown,
+    seconds_shown,
+    sets_shown,
+)
+from cvo_export.study.workers import Engine
 
-FEATURES_FOLDER = "features"
-TIMING_FILE, REPORT_FILE, TABLE_FILE = "timing.json", "compare.json", "compare.txt"
+TABLE_FILE = "compare.txt"
 
 
 def compare(
-    out: Path,
-    options: Mapping[str, Any],
-    methods: Sequence[str],
-    seeds: int,
-    *,
-    jobs: int | None,
-    cache: Path | None,
-    progress: Progress,
-    say: Say,
+    grid: Grid, folder: CellFolder, engine: Engine, progress: Progress, say: Say
 ) -> list[str]:
-    """Fill in the cells that are missing, time the bundles of seed 0; returns the table's lines.
+    """Run a study of one grid and write ``results.json`` and ``compare.txt``; returns its lines.
 
-    Parameters
-    ----------
-    out
-        Folder of cells, runs, bundles, the report and the table.
-    options
-        Arguments of ``configure`` but for method, seed and the method's own options.
-    methods, seeds
-        Names, and how many seeds from 0 on.
-    jobs
-        Cells that run at a time; all allowed cores by default.
-    cache
-        Folder of features; by default in ``out``.
-    progress, say
-        Of the features; a line for every cell that ends.
-
-    Raises
-    ------
-    UsageError
-        An unknown method, or cells of other options in the folder.
-    SinkError
-        The folder cannot be written.
-    CvoError
-        Of the kind of the first cell that failed; the others have been run.
+    Raises UsageError where the folder has cells of other options, which the table would leave out;
+    otherwise as ``run_study``.
     """
-    dataset = open_dataset(options["dataset"])
-    common = {**options, "split": options["split"] or default_kind(dataset)}
-
-    def config_of(method: str, seed: int) -> TrainConfig:
-        return configure(method=method, seed=seed, head={}, **common)
-
-    names = list(dict.fromkeys(methods))
-    configs = {
-        _cell_name(method, seed): config_of(method, seed)
-        for method, seed in product(names, range(seeds))
-    }
-    folder = CellFolder(out, cache or out / FEATURES_FOLDER)
-    folder.check(
-        lambda cell, _: config_of(cell.method, cell.seed) if cell.method in TRAINABLE else None
-    )
-    engine = partial(run_tasks, jobs or allowed_cores())
-    cells = list(folder.fill(configs, {}, engine, progress, say).values())
-    first = {cell.method: cell for cell in cells if cell.seed == 0}
-    timing = timed(
-        out / TIMING_FILE,
-        {name: (cell.bundle, folder.bundle(_cell_name(name, 0))) for name, cell in first.items()},
-        dataset,
-    )
-    lines = table(dataset.name, common["split"], cells, timing)
-    report = {
-        "dataset": dataset.name,
-        "heads": {name: configs[_cell_name(name, 0)].head for name in names},
-        "options": {
-            key: value
-            for key, value in msgspec.to_builtins(next(iter(configs.values()))).items()
-            if key not in ("dataset", "weights", "head", "seed")
-        },
-        "confidence": CONFIDENCE,
-        "versions": versions(("cvo-edge", "cvo-export", "torch", "timm", "onnx", "scikit-learn")),
-        "timing": timing,
-        "cells": cells,
-    }
-    write_json(out / REPORT_FILE, report)
-    write_whole(out / TABLE_FILE, "\n".join(lines) + "\n")
+    _check_folder(grid, folder)
+    lines = table(run_study(_study(grid), folder, engine, progress, say))
+    write_whole(folder.out / TABLE_FILE, "\n".join(lines) + "\n")
     return lines
 
 
-def _cell_name(method: str, seed: int) -> str:
-    return f"{method}-{seed}"
+def _study(grid: Grid) -> Study:
+    return Study(title="Methods and baselines compared", grids=[grid])
 
 
-# -- table --------------------------------------------------------------------------------------
+def _check_folder(grid: Grid, folder: CellFolder) -> None:
+    """Raise UsageError for cells that are not of this grid with any methods and seeds."""
+    names = folder.names()
+    earlier = [name for name in names if name.rpartition("-")[0] in TRAINABLE]
+    if earlier:
+        raise UsageError(
+            f"{folder.out}: cells of an earlier version ({', '.join(earlier)}); name a new folder"
+        )
+    if not names:
+        return
+    seeds = 1 + max(folder.read(name).seed for name in names)
+    every = replace(grid, methods=list(TRAINABLE), seeds=max(seeds, grid.seeds))
+    known = plan_study(_study(every)).configs
+    others = [name for name in names if name not in known]
+    if others:
+        raise UsageError(
+            f"{folder.out}: cells of other options ({', '.join(others)}); name a new folder"
+        )
+
 
 _HEADER = (
     "method",
     "coverage",
     "all six",
-    "width",
+    "mean width",
     "score",
     "joint scope",
     "volume^1/6",
@@ -132,74 +76,47 @@ _HEADER = (
     "M param.",
     "frame ms",
 )
-# Columns behind the name that a network's own bounds have, too.
-_SHARED = 4
 
 
-def table(dataset: str, split: str, cells: Sequence[Cell], timing: Timing) -> list[str]:
-    """Return the comparison as lines of text for a person."""
-    seeds = ", ".join(str(seed) for seed in sorted({cell.seed for cell in cells}))
+def table(results: Results) -> list[str]:
+    """Return the table of a study of one grid as lines of text."""
+    by_method: dict[str, list[Cell]] = {}
+    for place in results.places:
+        by_method.setdefault(place.method, []).append(results.cells[place.cell])
+    (timing,) = results.timing.values()
+    first = results.places[0]
+    seeds = sorted({place.seed for place in results.places})
+    # A baseline is used for its own bounds; those of a method are a step on the way to its sets.
     rows: list[tuple[str, ...]] = [_HEADER]
-    for method in dict.fromkeys(cell.method for cell in cells):
-        of_method = [cell for cell in cells if cell.method == method]
-        own = [cell.own for cell in of_method if cell.own is not None]
-        marginal = [cell.marginal for cell in of_method]
-        if method not in BASELINES:
-            rows.append((method, *_figures_shown(marginal), *_bundle_shown(of_method, timing)))
-            continue
-        if own:
-            blank = ("-",) * (len(_HEADER) - 1 - _SHARED)
-            rows.append((f"{method}, own", *_figures_shown(own), *blank))
+    for method, cells in by_method.items():
+        own = own_shown(cells) if method in BASELINES else None
+        if own is not None:
+            rows.append((f"{method}, own", *own, *[BLANK] * (len(_HEADER) - 1 - len(own))))
+        ms = next(timing.ms[p.cell] for p in results.places if p.method == method and not p.seed)
         rows.append(
-            (f"{method}, conformal", *_figures_shown(marginal), *_bundle_shown(of_method, timing))
+            (
+                f"{method}, conformal" if method in BASELINES else method,
+                *sets_shown([cell.marginal for cell in cells]),
+                *joint_shown(cells),
+                error_shown(cell.point_error for cell in cells),
+                seconds_shown(cells),
+                f"{cells[0].head_parameters / 1e6:.2f}",
+                f"{ms['p50']:.2f} ({ms['p95']:.2f})",
+            )
         )
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADER))]
     return [
-        f"{dataset}, {split} split, seeds {seeds}: medians over seeds, sets of {CONFIDENCE:g}, "
-        "test frames",
+        f"{first.data}, {first.split} split, seeds {', '.join(map(str, seeds))}: medians over "
+        f"seeds, sets of {results.confidence:g}, test frames",
         "",
         *("  ".join(v.ljust(w) for v, w in zip(row, widths, strict=True)).rstrip() for row in rows),
         "",
-        "own: bounds of the network as they come; conformal: the same calibrated, pooled rule",
-        "coverage: of each degree of freedom, mean over six; all six: of those sets at once",
+        "own: the network's own bounds; conformal: the same bounds calibrated, pooled rule",
+        "coverage: mean over the six degrees of freedom; all six: of these sets at once",
         "score: interval score over each degree of freedom's deviation, each seed in brackets",
-        "joint scope: coverage of all six by sets made for it, and their volume in deviations, "
+        "joint scope: coverage of all six by the joint sets; volume: of these sets in deviations, "
         "geometric mean",
-        "train: processor seconds without features; M param.: millions behind the backbone, no "
-        "forest",
-        f"frame: array to interval, median and 95 %, {timing.threads} threads",
+        "train s: processor seconds without features; M param.: millions behind the backbone, "
+        "without a forest's trees",
+        f"frame ms: array to interval, median and 95 %, {timing.threads} threads",
     ]
-
-
-def _figures_shown(figures: Sequence[Figures]) -> tuple[str, ...]:
-    """Coverage to score of all seeds: what the network's own bounds have, too."""
-    scores = [entry.normalised_interval_score for entry in figures]
-    width_m = _median([entry.median_width.m for entry in figures])
-    width_deg = _median([entry.median_width.deg for entry in figures])
-    return (
-        f"{_median([entry.mean_coverage for entry in figures]):.3f}",
-        f"{_median([entry.joint_coverage for entry in figures]):.3f}",
-        f"{100 * width_m:.2f} cm {width_deg:.2f} deg",
-        f"{_median(scores):.3f} ({', '.join(f'{score:.3f}' for score in scores)})",
-    )
-
-
-def _bundle_shown(cells: Sequence[Cell], timing: Timing) -> tuple[str, ...]:
-    """Joint scope to milliseconds: what the bundle has as a whole."""
-    volume = _median([cell.joint_volume["geometric_mean"] for cell in cells])
-    error_m = _median([cell.point_error["median_m"] for cell in cells])
-    error_deg = _median([cell.point_error["median_deg"] for cell in cells])
-    seconds = [cell.training.processor for cell in cells if cell.training is not None]
-    ms = timing.ms[cells[0].method]
-    return (
-        f"{_median([cell.joint.joint_coverage for cell in cells]):.3f}",
-        f"{volume ** (1 / 6):.3f}",
-        f"{100 * error_m:.2f} cm {error_deg:.2f} deg",
-        f"{_median(seconds):.0f}" if seconds else "-",
-        f"{cells[0].head_parameters / 1e6:.2f}",
-        f"{ms['p50']:.2f} ({ms['p95']:.2f})",
-    )
-
-
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values))

@@ -1,4 +1,4 @@
-"""Pictures of a study: sets over one and two dimensions, the tube under noise, and curves."""
+"""Pictures of a study: sets over frames and from above, the tube under noise, and curves."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Colours that differ for colour-blind readers, too (Okabe and Ito 2008).
+# Colours that colour-blind readers can tell apart (Okabe and Ito 2008).
 _LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _COLUMNS = 4
-# More hide one another and the flight.
+# More boxes would hide the flight.
 _TUBE_BOXES = 25
-# Of the flight's extent: boxes that are smaller cannot be told from its line.
+# Share of the flight's extent: smaller boxes cannot be told from its line.
 _VISIBLE = 0.06
-# Of the 90 % quantile of the widest method's sets.
+# Limit of the axes, in 90 % quantiles of the widest method's sets.
 _REACH = 1.2
 
 
 def comparison(tracks: Mapping[str, Track]) -> Figure:
-    """Draw for each method the sets of x over the frames and of x and y from above.
+    """Draw each method's sets of x over the frames, and of x and y from above.
 
-    Each once as they are, and once about the truth, in centimetres, where widths can be seen.
+    Both are drawn twice: absolute in metres, and relative to the truth in centimetres, which shows
+    their widths.
     """
     figure = _figure(3.8 * len(tracks), 13.0)
     axes = figure.subplots(4, len(tracks), squeeze=False)
@@ -42,14 +43,14 @@ def comparison(tracks: Mapping[str, Track]) -> Figure:
         draw_from_above(axes[2, column], track)
         _draw_plane_about_truth(axes[3, column], track, reach)
         axes[0, column].set_title(method)
-        # All in the scale of the first, so that widths can be compared.
+        # One scale for all, so that widths can be compared.
         axes[0, column].set_ylim(axes[0, 0].get_ylim())
         axes[2, column].set_title("")
     return figure
 
 
 def _usual_reach(track: Track) -> float:
-    """How far the ends of the sets of x are from the truth in nine of ten frames, centimetres."""
+    """90 % quantile of the distances from the truth to the ends of the sets of x, centimetres."""
     ends = [(track.estimates[r].lower[0], track.estimates[r].upper[0]) for r in track.rows]
     distance = 100.0 * np.abs(np.array(ends) - track.truth[track.rows, :1])
     bounded = distance[np.isfinite(distance)]
@@ -73,7 +74,7 @@ def _draw_about_truth(axes: Axes, track: Track, reach: float) -> None:
     axes.axhline(0.0, color=TRUTH, linewidth=0.9)
     axes.plot(missed, np.zeros(len(missed)), "x", color=MISSED, markersize=5)
     axes.set_ylim(-reach, reach)
-    axes.set_ylabel("set of tx about the truth (cm)")
+    axes.set_ylabel("set of tx minus truth (cm)")
     axes.set_xlabel("frame")
     axes.margins(x=0.01)
 
@@ -94,14 +95,14 @@ def _draw_plane_about_truth(axes: Axes, track: Track, reach: float) -> None:
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
     axes.set_aspect("equal")
-    axes.set_xlabel("tx about the truth (cm)")
-    axes.set_ylabel("ty about the truth (cm)")
+    axes.set_xlabel("tx minus truth (cm)")
+    axes.set_ylabel("ty minus truth (cm)")
 
 
 def tube(tracks: Mapping[str, Track]) -> Figure:
-    """Draw for each noise the boxes of x, y and z around the flight, all in one scale.
+    """Draw the boxes of x, y and z around the flight for each noise, all in one scale.
 
-    Boxes that would be too small to see are drawn larger, all by one factor that the title states.
+    Boxes too small to see are enlarged by one factor for all, which the title states.
     """
     rows = -(-len(tracks) // _COLUMNS)
     figure = _figure(4.2 * min(_COLUMNS, len(tracks)), 4.4 * rows)
@@ -110,7 +111,7 @@ def tube(tracks: Mapping[str, Track]) -> Figure:
     centre = 0.5 * (flight.min(axis=0) + flight.max(axis=0))
     extent = float(np.ptp(flight, axis=0).max())
     width = _widths(first)
-    # Unbounded sets have none.
+    # Unbounded sets have no finite width.
     usual = float(width[np.isfinite(width)].mean()) if np.isfinite(width).any() else extent
     times = max(1, int(_VISIBLE * extent / max(usual, 1e-9)))
     reach = 0.6 * (extent + times * usual)

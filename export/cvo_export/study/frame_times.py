@@ -1,4 +1,4 @@
-"""What a frame costs: bundles beside each other, from array to interval."""
+"""Time of a frame, from array to interval, of bundles that take turns."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from cvo_export.evaluate import subset_indices
 from cvo_export.files import read_json, write_json
 
 _WARM_UP_ROUNDS, _ROUNDS = 15, 200
-# Frames of the timing pass, kept in memory and taken in turn.
+# Different frames of the timing pass, kept in memory.
 _TIMED_FRAMES = 20
 
 
 class Timing(Struct, frozen=True, forbid_unknown_fields=True):
-    """Milliseconds from array to interval; digests of the bundles, and where they were timed."""
+    """Milliseconds from array to interval; digests of the bundles, and the machine."""
 
     bundles: dict[str, str]
     threads: int
@@ -34,7 +34,8 @@ class Timing(Struct, frozen=True, forbid_unknown_fields=True):
 def timed(path: Path, bundles: Mapping[str, tuple[str, Path]], dataset: PoseDataset) -> Timing:
     """Return milliseconds a frame of bundles (digest, folder) by name.
 
-    Measured on test frames, and kept at ``path``, where it does not hold these bundles' yet.
+    Those kept at ``path`` if they are of these bundles; otherwise measured on test frames and
+    written there.
     """
     digests = {name: digest for name, (digest, _) in bundles.items()}
     if path.is_file():
@@ -49,7 +50,7 @@ def timed(path: Path, bundles: Mapping[str, tuple[str, Path]], dataset: PoseData
 
 
 def frame_ms(bundles: Mapping[str, Path], dataset: PoseDataset) -> dict[str, dict[str, float]]:
-    """Bundles take turns, a frame each, so that a change of the machine's speed meets all."""
+    """Time bundles in turns, one frame each: a change of the machine's speed affects all."""
     with ExitStack() as stack:
         odometers = {
             name: stack.enter_context(Odometer.load(folder)) for name, folder in bundles.items()
@@ -60,7 +61,7 @@ def frame_ms(bundles: Mapping[str, Path], dataset: PoseDataset) -> dict[str, dic
         spent: dict[str, list[float]] = {name: [] for name in names}
         for number in range(_WARM_UP_ROUNDS + _ROUNDS):
             image = images[number % len(images)]
-            # Each is first, and behind each other one, equally often.
+            # Each bundle is first, and follows each other one, equally often.
             shift = number % len(names)
             for name in names[shift:] + names[:shift]:
                 begin = perf_counter()

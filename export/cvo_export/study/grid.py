@@ -1,8 +1,8 @@
 """A study: grids of methods, backbones, data, noise, options and seeds; every cell once.
 
-The configuration is TOML, a list of grids; see ``Grid``. Cells that two grids have in common are
-run once. All are kept in one folder, so that an interrupted study goes on, and so that a study that
-has grown runs what is new.
+The configuration is TOML, a list of grids; see ``Grid``. A cell that two grids share is run once.
+All cells are kept in one folder: an interrupted study resumes, and an extended one runs only its
+new cells.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from cvo_export.datasets.describe import summary
 from cvo_export.files import write_json
 from cvo_export.networks.backbone import TIMM_WEIGHTS, Backbone, load_weights
 from cvo_export.progress import Progress
-from cvo_export.study.cells import CONFIDENCE, Cell, CellFolder, Say
+from cvo_export.study.cell import CONFIDENCE, Cell
+from cvo_export.study.cells import CellFolder, Say
 from cvo_export.study.frame_times import Timing, timed
 from cvo_export.study.workers import Engine
 from cvo_export.training.configure import configure
@@ -49,22 +50,23 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
     Attributes
     ----------
     name
-        Of the grid, in the report.
+        Title of the grid in the report.
     data
-        ``FORMAT:PATH`` each; ``$NAME`` and ``${NAME}`` stand for variables of the environment.
+        ``FORMAT:PATH`` each; ``$NAME`` and ``${NAME}`` are variables of the environment.
     split
-        One for all data; by default ``sequence`` where there are five or more, else ``block``.
+        One for all data; by default ``sequence`` for data of five or more sequences, else
+        ``block``.
     methods, backbones
         Names.
     weights
         ``timm``, ``none`` or a file, as for ``train``; variables as in ``data``.
     seeds
-        How many, from 0 on.
+        Number of seeds, from 0 on.
     noises
         ``NAME`` or ``NAME:STRENGTH`` each; every cell is also evaluated on test frames with each.
     vary
-        Option -> its values: ``stages``, ``grid``, ``share`` (of the training frames) or one of the
-        methods'.
+        Option -> its values: ``stages``, ``grid``, ``share`` (of the training frames) or an option
+        of the methods.
     size, stages, grid, copies, steps, fine_tune
         As for ``train``.
     """
@@ -112,11 +114,11 @@ class Place(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Results(Struct, frozen=True, forbid_unknown_fields=True):
-    """What ``results.json`` holds: no path but those that the configuration names itself.
+    """Content of ``results.json``; its only paths are those written in the configuration.
 
-    Seconds and milliseconds are of the machine; all else is the same wherever cells were run.
-    ``data``: name of each data set -> as the configuration has it; two of one name are told apart
-    by all of it. ``timing`` by name of the grid, of its first data set; milliseconds by cell.
+    Seconds and milliseconds depend on the machine; all other figures do not. ``data``: label of
+    each data set -> its text in the configuration; where two have the same name, their labels
+    include that text. ``timing`` by name of the grid, on its first data set; milliseconds by cell.
     """
 
     title: str
@@ -129,12 +131,13 @@ class Results(Struct, frozen=True, forbid_unknown_fields=True):
     versions: dict[str, str]
 
 
-class _Plan(Struct):
+class Plan(Struct):
     """The cells of a study by name: their configurations and the noises each is evaluated with.
 
-    ``labels`` of the data sets, by their text.
+    ``data`` are the opened data sets and ``labels`` their labels, both by text.
     """
 
+    data: dict[str, PoseDataset]
     labels: dict[str, str]
     places: list[Place]
     configs: dict[str, TrainConfig]
@@ -142,29 +145,27 @@ class _Plan(Struct):
 
 
 def read_study(path: Path) -> Study:
-    """Read a configuration; raises UsageError where it is none."""
+    """Read a configuration; raises UsageError where it is not valid."""
     try:
         return msgspec.convert(tomllib.loads(path.read_text("utf-8-sig")), Study)
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        # Of TOML, of its encoding, or of what it says.
+        # The encoding, the TOML, or the content is wrong.
         raise UsageError(f"{path}: expected a study, found {error}") from None
 
 
 def run_study(
     study: Study, folder: CellFolder, engine: Engine, progress: Progress, say: Say
 ) -> Results:
-    """Run the cells that are missing, time what is to be timed, and write ``results.json``.
+    """Run the missing cells, time the bundles, and write ``results.json``.
 
-    Raises UsageError before anything is run for a grid that cannot be, and for finished cells that
-    are of other data or weights; else as ``CellFolder.fill`` does, after all other cells have been
-    run.
+    Before anything is run, raises UsageError for an invalid grid, and for finished cells of other
+    data or weights; afterwards, raises what ``CellFolder.fill`` does.
     """
-    opened = {text: open_dataset(expanded(text)) for grid in study.grids for text in grid.data}
-    for dataset in opened.values():
+    plan = plan_study(study)
+    for dataset in plan.data.values():
         say(summary(dataset))
-    plan = _plan(study, opened)
     _check_networks(plan.configs.values())
     folder.check_data(plan.configs)
     cells = folder.fill(plan.configs, plan.noises, engine, progress, say)
@@ -176,9 +177,7 @@ def run_study(
         places=plan.places,
         cells=cells,
         timing={
-            grid.name: _timing(grid, plan, cells, folder, opened[grid.data[0]])
-            for grid in study.grids
-            if not grid.vary
+            grid.name: _timing(grid, plan, cells, folder) for grid in study.grids if not grid.vary
         },
         versions=versions(("cvo-edge", "cvo-export", "torch", "timm", "onnx", "scikit-learn")),
     )
@@ -190,27 +189,29 @@ def expanded(text: str) -> str:
     """Replace variables of the environment; raises UsageError where one is not set."""
     found = os.path.expandvars(text)
     if (unset := re.search(r"\$\{?(\w+)", found)) is not None:
-        raise UsageError(f"study: expected the variable {unset[1]} to be set, found {text!r}")
+        raise UsageError(f"{text}: the environment variable {unset[1]} is not set")
     return found
 
 
-def _plan(study: Study, opened: Mapping[str, PoseDataset]) -> _Plan:
-    plan = _Plan(_labels(opened), [], {}, {})
+def plan_study(study: Study) -> Plan:
+    """Open the data and name all cells of a study; raises UsageError for an invalid grid."""
+    opened = {text: open_dataset(expanded(text)) for grid in study.grids for text in grid.data}
+    plan = Plan(opened, _labels(opened), [], {}, {})
     names = [_file_safe(grid.name).lower() for grid in study.grids]
     if len(set(names)) < len(names):
         raise UsageError(
-            "study: expected a name of its own for every grid, in letters and digits alone, found "
+            "study: expected names of grids that differ in their letters and digits, found "
             + ", ".join(grid.name for grid in study.grids)
         )
     for grid in study.grids:
         try:
-            _add(plan, grid, opened)
+            _add(plan, grid)
         except UsageError as error:
             raise UsageError(f"grid {grid.name}: {error}") from None
     return plan
 
 
-def _add(plan: _Plan, grid: Grid, opened: Mapping[str, PoseDataset]) -> None:
+def _add(plan: Plan, grid: Grid) -> None:
     """Add the cells of a grid."""
     noises = [str(parse_noise(text)) for text in grid.noises]
     lists: dict[str, Sequence[Value]] = {
@@ -222,12 +223,12 @@ def _add(plan: _Plan, grid: Grid, opened: Mapping[str, PoseDataset]) -> None:
     }
     for name, values in lists.items():
         if len(set(values)) < len(values):
-            raise UsageError(f"{name}: expected each once, found {values}")
+            raise UsageError(f"{name}: expected each value once, found {values}")
     combinations = [dict(zip(grid.vary, v, strict=True)) for v in product(*grid.vary.values())]
     for data, backbone, method, varied, seed in product(
         grid.data, grid.backbones, grid.methods, combinations, range(grid.seeds)
     ):
-        dataset = opened[data]
+        dataset = plan.data[data]
         split = grid.split or default_kind(dataset)
         config = _config(grid, data, split, backbone, method, varied, seed)
         check_roles(config, dataset)
@@ -241,11 +242,11 @@ def _add(plan: _Plan, grid: Grid, opened: Mapping[str, PoseDataset]) -> None:
 
 
 def _check_networks(configs: Iterable[TrainConfig]) -> None:
-    """Raise UsageError for a backbone that cannot be built, or whose weights do not fit."""
+    """Raise UsageError for a backbone that cannot be built, or that its weights do not fit."""
     distinct = {
         msgspec.json.encode((c.backbone, c.height, c.width, c.weights)): c
         for c in configs
-        # They would have to be fetched.
+        # These would have to be downloaded.
         if c.weights != TIMM_WEIGHTS
     }
     for config in distinct.values():
@@ -307,16 +308,17 @@ def _cell_name(config: TrainConfig, data: str, weights: str, dataset_name: str) 
 
 def _timing(
     grid: Grid,
-    plan: _Plan,
+    plan: Plan,
     cells: Mapping[str, Cell],
     folder: CellFolder,
-    dataset: PoseDataset,
 ) -> Timing:
     """Time the bundles of seed 0 of a grid on its first data set."""
     first = (grid.name, plan.labels[grid.data[0]], 0)
     names = [p.cell for p in plan.places if (p.grid, p.data, p.seed) == first]
     bundles = {name: (cells[name].bundle, folder.bundle(name)) for name in names}
-    return timed(folder.out / f"timing-{_file_safe(grid.name)}.json", bundles, dataset)
+    return timed(
+        folder.out / f"timing-{_file_safe(grid.name)}.json", bundles, plan.data[grid.data[0]]
+    )
 
 
 def _file_safe(text: str) -> str:

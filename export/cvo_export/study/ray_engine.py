@@ -1,6 +1,6 @@
-"""Tasks on a Ray cluster: the same as ``workers.run_tasks``, on as many machines as it has.
+"""Tasks on a Ray cluster: ``workers.run_tasks`` on all its machines.
 
-All machines see the folders of the study under the same paths, and have the same packages.
+All machines need the same packages, and must see the folders of the study under the same paths.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import Any
 from cvo_edge.errors import CvoError, UsageError
 from cvo_export.study.workers import Ended, Engine, Task, TaskError, attempt
 
-# A task whose process or machine dies is run again, from its checkpoints, so many times.
+# How often a task is retried, from its checkpoints, after its process or machine has died.
 _RETRIES = 3
 
 
-# Connecting to an address that nobody listens at takes Ray minutes.
+# Ray itself takes minutes to notice that nobody listens at an address.
 _SECONDS_TO_CONNECT = 5.0
 
 
@@ -30,32 +30,32 @@ _SECONDS_TO_CONNECT = 5.0
 def ray_engine() -> Iterator[Engine]:
     """Join the cluster that ``RAY_ADDRESS`` names or that was started on this machine.
 
-    Yields what runs tasks by name, one a core; one that fails does not keep the others from
-    running.
+    Yields a function that runs tasks by name, one on each core; the others continue after a
+    failure.
 
-    Raises UsageError where ray is not installed or there is no cluster.
+    Raises UsageError where ray is not installed or no cluster is found.
     """
     _take_the_heads_side()
     try:
         import ray
     except ImportError:
-        raise UsageError('study: expected ray, found none; pip install "cvo-export[ray]"') from None
+        raise UsageError('study: ray is not installed; pip install "cvo-export[ray]"') from None
     address = _address()
     if address is None or not _listening(address):
         raise UsageError(
-            f"study: expected a Ray cluster at {address or 'any address'}, found none; start one "
-            "with ray start --head, or name it in RAY_ADDRESS as HOST:PORT"
+            f"study: no Ray cluster at {address or 'any address'}; start one with "
+            "ray start --head, or name one in RAY_ADDRESS as HOST:PORT"
         )
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        # Tasks say themselves what they have to say.
+        # Tasks report for themselves.
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-        # It puts its own in their place, with another exit code.
+        # Ray replaces them by its own, with another exit code.
         for number, handler in handlers.items():
             signal.signal(number, handler)
     except (ConnectionError, ValueError, RuntimeError) as error:
         line = next(iter(str(error).splitlines()), type(error).__name__)
-        raise UsageError(f"study: expected a Ray cluster at {address}, found {line}") from None
+        raise UsageError(f"study: cannot join the Ray cluster at {address}: {line}") from None
     try:
         yield partial(_run, ray)
     finally:
@@ -63,7 +63,7 @@ def ray_engine() -> Iterator[Engine]:
 
 
 def _take_the_heads_side() -> None:
-    """Use a token where ``ray start`` does: where its user has one, unless told otherwise.
+    """Use a token where ``ray start`` does: where the user has one, unless told otherwise.
 
     Ray reads the variable when it is imported.
     """
@@ -74,7 +74,7 @@ def _take_the_heads_side() -> None:
 
 
 def _address() -> str | None:
-    """HOST:PORT of a cluster: as the environment names it, else of this machine's last head."""
+    """HOST:PORT of a cluster: from the environment, else that of this machine's last head."""
     named = os.environ.get("RAY_ADDRESS", "auto")
     if named != "auto":
         return named
@@ -110,7 +110,7 @@ def _on_a_worker(task: Task, folder: Path) -> CvoError | None:
     import torch
 
     torch.set_num_threads(1)
-    # Relative paths of data and weights mean the same as where the study was started.
+    # Relative paths of data and weights mean the same here as where the study was started.
     with suppress(OSError):
         os.chdir(folder)
     return attempt(task)

@@ -1,4 +1,4 @@
-"""Tasks beside each other, each in a process of its own with one thread of torch."""
+"""Parallel tasks, each in a process of its own with one thread of torch."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from multiprocessing.context import SpawnProcess
 from cvo_edge.errors import CvoError, SinkError
 
 Task = Callable[[], None]
-# Name of a task that has ended, and what went wrong.
+# Called with the name of a task that has ended, and its error if it failed.
 Ended = Callable[[str, CvoError | None], None]
-# Runs all tasks, each once.
+# Runs every task once.
 Engine = Callable[[Mapping[str, Task], Ended], None]
 
 
-# A call into a library ends before a process can unwind.
+# A process unwinds only after a pending call into a library has returned.
 _SECONDS_TO_LEAVE = 10.0
 
 
 class TaskError(CvoError):
-    """A task ended by a defect, or its process was killed."""
+    """A task failed because of a defect, or its process was killed."""
 
 
 def run_tasks(jobs: int, tasks: Mapping[str, Task], ended: Ended) -> None:
-    """Run tasks by name, ``jobs`` at a time; one that fails does not keep the others from running.
+    """Run tasks by name, ``jobs`` at a time; the others continue after a failure.
 
-    A single one at a time runs in this process. Tasks are sent to processes, so they must pickle.
-    No process outlives this call.
+    With one job, tasks run in this process. With several, they are sent to other processes and must
+    pickle. No process outlives this call.
     """
     if jobs > 1:
         _in_processes(tasks, jobs, ended)
@@ -54,7 +54,7 @@ def _in_processes(tasks: Mapping[str, Task], jobs: int, ended: Ended) -> None:
                 with _interrupts_ignored():
                     process.start()
                 running[receiver] = (name, process)
-                # The process alone holds it now: its death is seen here as the pipe's end.
+                # Only the process holds its end now, so that its death closes the pipe.
                 sender.close()
             ready = wait(list(running))
             for receiver in [receiver for receiver in running if receiver in ready]:
@@ -83,7 +83,7 @@ def _outcome(receiver: Connection, process: SpawnProcess) -> CvoError | None:
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """A process started here leaves SIGINT to its parent, which ends it."""
+    """Let processes started here ignore SIGINT; their parent ends them."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
@@ -94,14 +94,14 @@ def _interrupts_ignored() -> Iterator[None]:
 def _worker(sender: Connection, task: Task) -> None:
     import torch
 
-    # Unwind, so that half of a bundle or a semaphore is not left behind.
+    # Unwind, so that no temporary file or semaphore is left behind.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     torch.set_num_threads(1)
     sender.send(attempt(task))
 
 
 def attempt(task: Task) -> CvoError | None:
-    """Run a task; returns what went wrong."""
+    """Run a task; returns its error if it failed."""
     try:
         task()
     except CvoError as error:

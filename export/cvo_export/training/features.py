@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from threading import Lock
 from typing import Any
 from zipfile import BadZipFile
@@ -20,7 +19,8 @@ from numpy.typing import NDArray
 
 from cvo_edge.engine.cores import allowed_cores
 from cvo_edge.engine.session import Session
-from cvo_edge.errors import SinkError, SourceError
+from cvo_edge.errors import SourceError
+from cvo_edge.files import whole_file
 from cvo_edge.input import preprocess
 from cvo_edge.vocabulary import Crop
 from cvo_export.data.augment import AugmentConfig, augmented, model_intrinsics
@@ -141,14 +141,9 @@ def _stored(path: Path, count: int) -> dict[str, NDArray[Any]] | None:
 
 
 def _store(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """Write under a name of its own first: another run may be writing the same file."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with NamedTemporaryFile(dir=path.parent, suffix=".partial", delete=False) as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
-        Path(stream.name).replace(path)
-    except OSError as error:
-        raise SinkError(f"{path}: cannot be written: {error.strerror}") from None
+    """Write whole or not at all: another run may be writing the same file."""
+    with whole_file(path, make_folder=True) as stream:
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
 
 
 def _one_copy(

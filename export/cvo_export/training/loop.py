@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cvo_edge.errors import UsageError
+from cvo_edge.files import whole_file
 from cvo_export.data.splits import Split, deal_folds, make_split, training_frames
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.networks.backbone import Backbone, load_weights
@@ -415,22 +416,19 @@ class _Lesson:
         averaged: AveragedModel,
         best: dict[str, Any],
     ) -> None:
-        unfinished = self._path.with_suffix(".partial")
-        torch.save(
-            {
-                "phase": phase,
-                "step": step,
-                "ended": ended,
-                "weights": self.both.state_dict(),
-                "optimiser": optimiser.state_dict(),
-                "averaged": averaged.state_dict(),
-                "best": best,
-                "history": [tuple(entry) for entry in self.history],
-                "torch_rng": torch.get_rng_state(),
-            },
-            unfinished,
-        )
-        unfinished.replace(self._path)
+        state = {
+            "phase": phase,
+            "step": step,
+            "ended": ended,
+            "weights": self.both.state_dict(),
+            "optimiser": optimiser.state_dict(),
+            "averaged": averaged.state_dict(),
+            "best": best,
+            "history": [tuple(entry) for entry in self.history],
+            "torch_rng": torch.get_rng_state(),
+        }
+        with whole_file(self._path) as stream:
+            torch.save(state, stream)
 
     def _read_checkpoint(self) -> dict[str, Any] | None:
         if not self._path.is_file():

@@ -12,6 +12,7 @@ from msgspec import Meta
 from torch import Tensor, nn
 
 from cvo_edge.errors import SinkError, UsageError
+from cvo_edge.files import whole_file, write_whole
 from cvo_edge.vocabulary import Crop, SplitKind
 from cvo_export.data.augment import AugmentConfig
 from cvo_export.data.splits import Split, make_split, read_split_spec, same_split
@@ -134,20 +135,17 @@ class Run:
     history: list[History]
 
     def save(self, run_dir: Path) -> None:
-        """Write what training learned, whole or not at all."""
+        """Write what training learned, whole or not at all; raises SinkError."""
         target = (self.target.reference_q_xyzw, self.target.mean, self.target.std)
-        partial = run_dir / (NETWORK_FILE + ".partial")
-        torch.save(
-            {
-                "backbone": self.graph.backbone.state_dict(),
-                "head": self.graph.head.state_dict(),
-                "target": [torch.from_numpy(values) for values in target],
-                "weights_sha256": self.weights_sha256,
-                "history": [tuple(entry) for entry in self.history],
-            },
-            partial,
-        )
-        partial.replace(run_dir / NETWORK_FILE)
+        content = {
+            "backbone": self.graph.backbone.state_dict(),
+            "head": self.graph.head.state_dict(),
+            "target": [torch.from_numpy(values) for values in target],
+            "weights_sha256": self.weights_sha256,
+            "history": [tuple(entry) for entry in self.history],
+        }
+        with whole_file(run_dir / NETWORK_FILE) as stream:
+            torch.save(content, stream)
 
     @property
     def best(self) -> History:
@@ -193,12 +191,10 @@ def claim_run(run_dir: Path, config: TrainConfig, dataset: PoseDataset, split: S
     """
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
-        split.write(run_dir / SPLIT_FILE, dataset)
-        partial = run_dir / (CONFIG_FILE + ".partial")
-        partial.write_bytes(_encoded(config))
-        partial.replace(run_dir / CONFIG_FILE)
     except OSError as error:
         raise SinkError(f"{run_dir}: cannot be written: {error.strerror}") from None
+    split.write(run_dir / SPLIT_FILE, dataset)
+    write_whole(run_dir / CONFIG_FILE, _encoded(config))
 
 
 def _encoded(config: TrainConfig) -> bytes:
