@@ -92,7 +92,14 @@ def run(
         ),
     ],
     output: Annotated[str, typer.Option("-o", "--output", help="File, or - for stdout.")] = "-",
-    format: Annotated[FormatName, typer.Option(help="Output format.")] = FormatName.JSONL,
+    format: Annotated[
+        FormatName | None,
+        typer.Option(
+            help="Output format; by default that of the file's suffix (.jsonl, .csv, .tum), "
+            "else jsonl.",
+            show_default=False,
+        ),
+    ] = None,
     confidence: Annotated[float, typer.Option(help="One of those stored in the bundle.")] = 0.9,
     scope: Annotated[
         ScopeName, typer.Option(help="Each degree of freedom, or all six at once.")
@@ -133,10 +140,12 @@ def run(
     from cvo_edge.input.capture import shown
     from cvo_edge.input.sources import open_source
     from cvo_edge.odometer import Odometer
-    from cvo_edge.output.sinks import Sink
+    from cvo_edge.output.records import header_of
+    from cvo_edge.output.sinks import Sink, format_of
     from cvo_edge.programs.run import RunSummary
     from cvo_edge.programs.run import run as run_frames
 
+    written_as = format_of(output, format.value if format else None)
     _refuse_overwriting(output, source, ground_truth, bundle, public_key)
     truth = open_ground_truth(ground_truth) if ground_truth else None
     frames = open_source(source, fps, timeout)
@@ -155,7 +164,14 @@ def run(
                 f"{odometer.calibration.method} and {scope.value}"
             )
         summary = RunSummary(odometer.chart.dof, confidence, scope, with_truth=truth is not None)
-        with Sink(output, format.value, region=region) as sink:
+        header = header_of(
+            odometer.calibration,
+            odometer.chart,
+            confidence,
+            scope.value,
+            stamps="fps" if fps else "arrival" if frames.live else None,
+        )
+        with Sink(output, written_as, header, region=region) as sink:
             try:
                 run_frames(
                     odometer,
