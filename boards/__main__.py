@@ -32,7 +32,7 @@ from boards.compare import (
     difference,
     difference_lines,
     exceeded,
-    read_records,
+    stacked,
 )
 from boards.frames import DATASET, write_test_frames
 from boards.machine import BOARDS, FOLDER, ROOT, Board, SetUpError, emulator_version, set_up
@@ -41,6 +41,7 @@ from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.engine.cores import allowed_cores
 from cvo_edge.errors import CvoError
 from cvo_edge.ground_truth import MATRIX_SUFFIX, read_pose_matrix
+from cvo_edge.output.records import read_records
 from cvo_edge.pose import Chart
 
 CONFIDENCE = 0.9
@@ -238,7 +239,7 @@ def _records(
     # A cache entry is told by /proc/cpuinfo, which an emulated x86 shares with this machine.
     how = (f"--confidence={CONFIDENCE}", "--threads=1", "--no-cache", "--quiet")
     _output(python, *_RUNTIME, "run", folder, frames, *options, *how, f"--output={output}")
-    return read_records(output)
+    return stacked(read_records(output))
 
 
 def _coverage(records: Records, frames: Path, calibration: Calibration) -> dict[str, Any]:

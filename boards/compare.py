@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import geometry
+from cvo_edge.estimate import Record, RecordedInterval
 from cvo_edge.pose import Chart
 from cvo_edge.sets import Bands, ConformalSet
 
@@ -54,38 +53,33 @@ class Records:
         return np.array([[len(row) for row in each.bands or [()] * 6] for each in self.sets])
 
 
-def read_records(path: Path) -> Records:
-    """Read the JSON lines of ``cvo-edge run``."""
-    return parse_records(json.loads(line) for line in path.read_text("utf-8").splitlines())
-
-
-def parse_records(lines: Iterable[Mapping[str, Any]]) -> Records:
-    """Records as they are decoded from JSON -> arrays; null bounds become infinite."""
+def stacked(lines: Iterable[Record]) -> Records:
+    """Put the numbers of records into arrays; null bounds become infinite."""
     entries = list(lines)
     poses = np.full((len(entries), 7), math.nan)
     for row, entry in zip(poses, entries, strict=True):
-        if entry["pose"] is not None:
-            row[:] = [*entry["pose"]["t_m"], *entry["pose"]["q_xyzw"]]
+        if entry.pose is not None:
+            row[:] = [*entry.pose.t_m, *entry.pose.q_xyzw]
     return Records(
-        tuple(entry["source"] for entry in entries),
-        tuple(entry["status"] for entry in entries),
+        tuple(entry.source for entry in entries),
+        tuple(entry.status for entry in entries),
         poses,
-        tuple(_set_of(entry["interval"]) for entry in entries),
+        tuple(_set_of(entry.interval) for entry in entries),
     )
 
 
-def _set_of(interval: Mapping[str, Any] | None) -> ConformalSet:
+def _set_of(interval: RecordedInterval | None) -> ConformalSet:
     if interval is None:
         return ConformalSet(np.full(6, -math.inf), np.full(6, math.inf))
     bands: Bands | None = None
-    if interval["bands"] is not None:
+    if interval.bands is not None:
         bands = tuple(
             tuple((_end(low, -math.inf), _end(high, math.inf)) for low, high in row)
-            for row in interval["bands"]
+            for row in interval.bands
         )
     return ConformalSet(
-        np.array([_end(value, -math.inf) for value in interval["lower"]]),
-        np.array([_end(value, math.inf) for value in interval["upper"]]),
+        np.array([_end(value, -math.inf) for value in interval.lower]),
+        np.array([_end(value, math.inf) for value in interval.upper]),
         bands,
     )
 

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
         SourceError,
         UsageError,
     )
-    from cvo_edge.estimate import PoseInterval, Reason, Status
+    from cvo_edge.estimate import PoseInterval, Reason, Record, Status
     from cvo_edge.input.frame import Frame
     from cvo_edge.input.sources import open_source
     from cvo_edge.odometer import Odometer
-    from cvo_edge.output.records import Record, read_records
+    from cvo_edge.output.records import Header, Records, read_records
     from cvo_edge.pose import Chart, Pose
     from cvo_edge.sets import ConformalSet, Ellipsoids
 
@@ -47,6 +47,7 @@ __all__ = [
     "Ellipsoids",
     "Frame",
     "GateError",
+    "Header",
     "ModelCache",
     "ModelError",
     "Odometer",
@@ -54,6 +55,7 @@ __all__ = [
     "PoseInterval",
     "Reason",
     "Record",
+    "Records",
     "SinkError",
     "SourceError",
     "Status",
@@ -74,13 +76,15 @@ _HOMES = {
     "Ellipsoids": "sets",
     "Frame": "input.frame",
     "GateError": "errors",
+    "Header": "output.records",
     "ModelCache": "engine.model_cache",
     "ModelError": "errors",
     "Odometer": "odometer",
     "Pose": "pose",
     "PoseInterval": "estimate",
     "Reason": "estimate",
-    "Record": "output.records",
+    "Record": "estimate",
+    "Records": "output.records",
     "SinkError": "errors",
     "SourceError": "errors",
     "Status": "estimate",

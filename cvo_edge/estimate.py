@@ -9,15 +9,21 @@ from enum import StrEnum
 from itertools import product
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType
 from numpy.typing import ArrayLike, NDArray
 
-from cvo_edge.errors import UsageError
-from cvo_edge.pose import Chart, Pose
-from cvo_edge.sets import Bands, ConformalSet
+from cvo_edge.errors import UsageError, printable
+from cvo_edge.pose import Chart, Pose, Rotation
+from cvo_edge.sets import Bands, ConformalSet, Ellipsoids
 from cvo_edge.vocabulary import Scope
 
 Array = NDArray[np.float64]
+SixOrUnbounded = tuple[
+    float | None, float | None, float | None, float | None, float | None, float | None
+]
+BandsOrUnbounded = tuple[tuple[tuple[float | None, float | None], ...], ...]
 
 
 class Status(StrEnum):
@@ -45,6 +51,55 @@ class Reason(StrEnum):
     STAMP_NOT_LATER = "stamp_not_later"  # degraded: not after the stamp of the frame before
     BOUNDS_CROSSED = "bounds_crossed"  # ok: a negative correction emptied a set; its middle stands
     PITCH_NEAR_90 = "pitch_near_90"  # ok: |pitch| > 80 deg, roll and yaw are ill-defined
+
+
+class _Strict(Struct, frozen=True, forbid_unknown_fields=True):
+    """Immutable; unknown keys are an error."""
+
+
+class RecordedPose(_Strict, frozen=True):
+    """``t_m``: tx ty tz of the camera in the world, metres; ``q_xyzw``: its rotation, unit."""
+
+    t_m: tuple[float, float, float]
+    q_xyzw: tuple[float, float, float, float]
+
+
+class RecordedRegion(_Strict, frozen=True):
+    """The region of all six degrees of freedom, as ``Ellipsoids`` describes it."""
+
+    radius: float
+    scale: list[list[float]]
+    centres: list[list[float]]
+
+
+class RecordedInterval(_Strict, frozen=True):
+    """The conformal set in the chart ``rotation``, m and rad; None (null) is unbounded.
+
+    ``bands`` are given per DoF for methods whose sets may be in pieces. ``region`` is UNSET (no
+    such key) unless the run was asked for regions, and None where the region is unbounded.
+    """
+
+    confidence: float
+    scope: Scope
+    rotation: Rotation
+    lower: SixOrUnbounded
+    upper: SixOrUnbounded
+    bounded: bool
+    bands: BandsOrUnbounded | None
+    region: RecordedRegion | UnsetType | None = UNSET
+
+
+class Record(_Strict, frozen=True):
+    """What is written about one frame: one JSON line, one row of CSV, one line of the table."""
+
+    seq: int
+    stamp_ns: int | None
+    source: str
+    status: Status
+    reasons: tuple[Reason, ...]
+    pose: RecordedPose | None
+    interval: RecordedInterval | None
+    latency_ms: dict[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,41 +203,98 @@ class PoseInterval:
         z = NormalDist().inv_cdf(0.5 + 0.5 * self.confidence)
         return np.diag(((self.upper - self.lower) / (2.0 * z)) ** 2)
 
-    def to_dict(self, *, region: bool = False) -> dict[str, Any]:
-        """The JSON record of this frame, as the README specifies it; on request with the region."""
-        pose: dict[str, Any] | None = None
-        interval: dict[str, Any] | None = None
+    def to_record(self, *, region: bool = False) -> Record:
+        """The record of this frame, with ``interval.region`` set on request."""
+        pose, interval = None, None
         if self.pose is not None:
-            lower, upper = self.lower.tolist(), self.upper.tolist()
-            bounded = self.bounded
-            pose = {"t_m": self.pose.t_m.tolist(), "q_xyzw": self.pose.q_xyzw.tolist()}
-            interval = {
-                "confidence": self.confidence,
-                "scope": self.scope,
-                "rotation": self.chart.rotation,
-                "lower": lower if bounded else _null_infinite(lower),
-                "upper": upper if bounded else _null_infinite(upper),
-                "bounded": bounded,
-                "bands": self.bands if bounded or self.bands is None else _null_bands(self.bands),
-            }
-        if region and interval is not None:
-            ellipsoids = self.conformal_set.ellipsoids
-            interval["region"] = None if ellipsoids is None else ellipsoids.to_dict()
-        return {
-            "seq": self.seq,
-            "stamp_ns": self.stamp_ns,
-            "source": self.source,
-            "status": self.status,
-            "reasons": self.reasons,
-            "pose": pose,
-            "interval": interval,
-            "latency_ms": self.latency_ms,
-        }
+            lower, upper = tuple(self.lower.tolist()), tuple(self.upper.tolist())
+            # As ``bounded``, which takes longer for twelve numbers that are lists already.
+            bounded, bands = all(map(math.isfinite, lower + upper)), self.bands
+            pose = RecordedPose(tuple(self.pose.t_m.tolist()), tuple(self.pose.q_xyzw.tolist()))
+            interval = RecordedInterval(
+                self.confidence,
+                self.scope,
+                self.chart.rotation,
+                lower if bounded else _null_infinite(lower),
+                upper if bounded else _null_infinite(upper),
+                bounded,
+                bands if bounded or bands is None else _null_bands(bands),
+                _recorded_region(self.conformal_set.ellipsoids) if region else UNSET,
+            )
+        return Record(
+            self.seq,
+            self.stamp_ns,
+            self.source,
+            self.status,
+            self.reasons,
+            pose,
+            interval,
+            dict(self.latency_ms),
+        )
+
+    def to_dict(self, *, region: bool = False) -> dict[str, Any]:
+        """The record as ``json.loads`` returns its JSON line: dicts, lists, strings, numbers."""
+        decoded: dict[str, Any] = msgspec.json.decode(
+            msgspec.json.encode(self.to_record(region=region))
+        )
+        return decoded
+
+    def __str__(self) -> str:
+        """One line: frame, status, reasons, position (m) and half-widths (cm, deg)."""
+        line = f"frame {self.seq} {self.status}"
+        if self.reasons:
+            line += f" ({', '.join(self.reasons)})"
+        if self.pose is None:
+            return line
+        x, y, z = self.pose.t_m.tolist()
+        line += f" at {x:.3f} {y:.3f} {z:.3f} m"
+        half = 0.5 * (self.upper - self.lower)
+        if not np.isfinite(half).any():
+            return f"{line}, unbounded"
+        cm = " ".join(f"±{value:.1f}" for value in (100.0 * half[:3]).tolist())
+        deg = " ".join(f"±{value:.1f}" for value in np.rad2deg(half[3:]).tolist())
+        return f"{line}, {cm} cm, {deg} deg ({self.confidence:g} {self.scope})"
+
+    def __repr__(self) -> str:
+        """The same line, marked as an object."""
+        return f"<PoseInterval {self}>"
+
+    def _repr_html_(self) -> str:
+        """Small table for notebooks: lower and upper bound of each degree of freedom."""
+        # Only notebooks need it.
+        from html import escape
+
+        name = f"frame {self.seq} {printable(self.source)}".rstrip()
+        caption = f"{name}: {', '.join([self.status, *self.reasons])}"
+        if self.pose is None:
+            return f"<p>{escape(caption)}</p>"
+        caption += f"; {self.confidence:g} {self.scope}, {self.chart.rotation}"
+        rows = "".join(
+            f"<tr><td>{dof} ({unit})</td><td>{low * scale:.3f}</td><td>{high * scale:.3f}</td></tr>"
+            for dof, unit, scale, low, high in zip(
+                self.chart.dof,
+                ["m"] * 3 + ["deg"] * 3,
+                [1.0] * 3 + [math.degrees(1.0)] * 3,
+                self.lower.tolist(),
+                self.upper.tolist(),
+                strict=True,
+            )
+        )
+        return (
+            f"<table><caption>{escape(caption)}</caption>"
+            f"<tr><th>DoF</th><th>lower</th><th>upper</th></tr>{rows}</table>"
+        )
 
 
-def _null_infinite(values: Iterable[float]) -> list[float | None]:
-    return [value if math.isfinite(value) else None for value in values]
+def _null_infinite(values: Iterable[float]) -> tuple[Any, ...]:
+    return tuple(value if math.isfinite(value) else None for value in values)
 
 
-def _null_bands(bands: Bands) -> list[list[list[float | None]]]:
-    return [[_null_infinite(band) for band in row] for row in bands]
+def _null_bands(bands: Bands) -> BandsOrUnbounded:
+    return tuple(tuple(_null_infinite(band) for band in row) for row in bands)
+
+
+def _recorded_region(ellipsoids: Ellipsoids | None) -> RecordedRegion | None:
+    if ellipsoids is None:
+        return None
+    return RecordedRegion(ellipsoids.radius, ellipsoids.scale.tolist(), ellipsoids.centres.tolist())

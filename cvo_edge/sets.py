@@ -42,14 +42,6 @@ class Ellipsoids:
         """Whether six coordinates (6,) lie in the region."""
         return self.distance(coordinates) <= self.radius
 
-    def to_dict(self) -> dict[str, Any]:
-        """The record's ``region``."""
-        return {
-            "radius": self.radius,
-            "scale": self.scale.tolist(),
-            "centres": self.centres.tolist(),
-        }
-
 
 def scaled_distance(centres: NDArray[Any], scale: NDArray[Any], y: Array) -> Array:
     """Return min_j |scale^-1 (y - centres_j)|.

@@ -52,19 +52,20 @@ def _killed(path: Path, generator: np.random.Generator) -> tuple[int, int]:
     )
     try:
         late = time.monotonic() + _LONGEST_S
-        while _lines(path) < wanted and process.poll() is None:
+        while _written(path) < wanted and process.poll() is None:
             if time.monotonic() > late:
                 raise RuntimeError(f"expected {wanted} records within {_LONGEST_S:g} s")
             time.sleep(0.0005)
         time.sleep(more_s)
-        seen = _lines(path)
+        seen = _written(path)
     finally:
         process.kill()
     return seen, process.wait()
 
 
-def _lines(path: Path) -> int:
-    return path.read_bytes().count(b"\n") if path.exists() else 0
+def _written(path: Path) -> int:
+    """Number of records, each a line; the first line is the header."""
+    return max(0, path.read_bytes().count(b"\n") - 1) if path.exists() else 0
 
 
 def _what_is_left(path: Path, seen: int) -> tuple[str, str | None]:

@@ -51,7 +51,7 @@ def _folder_of_images(number: int) -> tuple[str, str | None]:
             (folder / f"{place:03d}-b{suffix}").write_bytes(changed_bytes(content, generator))
         ended = command(["run", _BUNDLE, folder, "--quiet", "--threads", 1])
         finding = ended.misbehaviour((0,))
-        records = [] if finding else [json.loads(line) for line in ended.output.splitlines()]
+        records = [] if finding else _records(ended.output)
         if not finding and len(records) != 2 * _MANY:
             finding = f"{len(records)} records of {2 * _MANY}"
         for record in records:
@@ -62,11 +62,16 @@ def _folder_of_images(number: int) -> tuple[str, str | None]:
     return json.dumps([outcomes, finding and f"folder {number}: {finding}"]), None
 
 
+def _records(output: bytes) -> list[Any]:
+    """Return the lines behind the header, decoded."""
+    return [json.loads(line) for line in output.splitlines()[1:]]
+
+
 @cache
 def _as_ever() -> dict[str, object]:
     """Poses of the good files alone, by number."""
     ended = command(["run", _BUNDLE, _CLIP, "--quiet", "--threads", 1, "--max-frames", _MANY])
-    records = [json.loads(line) for line in ended.output.splitlines()]
+    records = _records(ended.output)
     return {f"{number:03d}": record["pose"] for number, record in enumerate(records)}
 
 
@@ -96,7 +101,7 @@ def videos(count: int) -> Tally:
 
 def _out_of_order(output: bytes) -> str | None:
     """Return what is wrong with a video's records: numbers, names or times out of turn, or None."""
-    records = [json.loads(line) for line in output.splitlines(keepends=True)]
+    records = _records(output)
     if [(record["seq"], record["source"]) for record in records] != [
         (number, f"clip.avi#{number}") for number in range(len(records))
     ]:

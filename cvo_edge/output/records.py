@@ -1,93 +1,182 @@
-"""Reading back what ``cvo-edge run`` wrote: JSON lines, also of a run that was killed."""
+"""The header that makes a stream of records readable without its bundle, and reading both back."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
-from os import PathLike
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import msgspec
 from msgspec import Struct
 
+from cvo_edge import __version__
+from cvo_edge.bundle.format import Calibration, Quaternion
 from cvo_edge.errors import SourceError
-from cvo_edge.estimate import Reason, Status
-from cvo_edge.pose import Rotation
-from cvo_edge.vocabulary import Scope
+from cvo_edge.estimate import Record
+from cvo_edge.pose import Chart, Rotation
+from cvo_edge.vocabulary import Precision, Provider, Scope
 
-Six = tuple[float, float, float, float, float, float]
-SixOrUnbounded = tuple[
-    float | None, float | None, float | None, float | None, float | None, float | None
-]
+Stamps = Literal["fps", "arrival"]
 
 
-class _Strict(Struct, frozen=True, forbid_unknown_fields=True):
-    """Immutable, no other keys."""
+class Header(
+    Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="header", tag_field="kind"
+):
+    """What holds for all records that follow it: bundle, frames, chart, confidence and scope.
 
-
-class RecordedPose(_Strict, frozen=True):
-    """``t_m``: tx ty tz of the camera in the world, metres; ``q_xyzw``: its rotation, unit."""
-
-    t_m: tuple[float, float, float]
-    q_xyzw: tuple[float, float, float, float]
-
-
-class RecordedInterval(_Strict, frozen=True):
-    """The set as recorded, in the chart ``rotation``, m and rad; null (None) is unbounded.
-
-    ``bands`` per DoF, for methods whose sets may be in pieces; ``region`` as ``run --region`` adds
-    it, else None.
+    Attributes
+    ----------
+    schema_version, software
+        Version of this format, and the program that wrote it.
+    bundle, method, digest, precision, provider
+        Name, method, digest, model precision and inference engine of the bundle.
+    frame_id, child_frame_id
+        A pose maps points of ``child_frame_id`` (the camera) into ``frame_id`` (the world).
+    rotation, reference_q_xyzw
+        Chart of the rotation numbers: ``tangent_reference`` is Log(R_reference^T R) with this
+        reference quaternion; ``tangent_predicted`` is Log(R_predicted^T R) with the record's own
+        pose; ``euler_zyx`` is roll, pitch, yaw. The reference is null except for
+        ``tangent_reference``.
+    dof, units
+        Names of the six degrees of freedom; units of the first and of the last three.
+    confidence, scope
+        Stated probability, for each degree of freedom (``marginal``) or all six (``joint``).
+    stamps
+        What ``stamp_ns`` counts from: ``fps``, frames counted at a given rate; ``arrival``, the
+        system clock when a camera's frame arrived; null, the times of the source, if it has any.
     """
 
+    schema_version: Literal[1] = 1
+    software: str
+    bundle: str
+    method: str
+    digest: str
+    precision: Precision
+    provider: Provider
+    frame_id: str
+    child_frame_id: str
+    rotation: Rotation
+    reference_q_xyzw: Quaternion | None
+    dof: tuple[str, str, str, str, str, str]
+    units: tuple[Literal["m"], Literal["rad"]]
     confidence: float
     scope: Scope
-    rotation: Rotation
-    lower: SixOrUnbounded
-    upper: SixOrUnbounded
-    bounded: bool
-    bands: tuple[tuple[tuple[float | None, float | None], ...], ...] | None
-    region: dict[str, Any] | None = None
+    stamps: Stamps | None
 
 
-class Record(_Strict, frozen=True):
-    """One line: what was said of one frame; keys as the README specifies them."""
+def header_of(
+    calibration: Calibration,
+    chart: Chart,
+    confidence: float,
+    scope: Scope,
+    stamps: Stamps | None = None,
+) -> Header:
+    """Header for the records of one bundle at one confidence and scope."""
+    model, pose, reference = calibration.model, calibration.pose, chart.reference_q_xyzw
+    return Header(
+        software=f"cvo-edge {__version__}",
+        bundle=calibration.name,
+        method=calibration.method,
+        digest=calibration.digest,
+        precision=model.precision,
+        provider=model.provider,
+        frame_id=pose.frame_id,
+        child_frame_id=pose.child_frame_id,
+        rotation=chart.rotation,
+        reference_q_xyzw=None if reference is None else tuple(reference.tolist()),
+        dof=chart.dof,
+        units=pose.units,
+        confidence=confidence,
+        scope=scope,
+        stamps=stamps,
+    )
 
-    seq: int
-    stamp_ns: int | None
-    source: str
-    status: Status
-    reasons: tuple[Reason, ...]
-    pose: RecordedPose | None
-    interval: RecordedInterval | None
-    latency_ms: dict[str, float]
+
+class Records:
+    """The records of a file of JSON lines, in its order: an iterator, so for one pass.
+
+    Attributes
+    ----------
+    header
+        The header of the record returned last; before the first record, that on the first line.
+        None where there is none, as in files of older versions. A file with several runs appended
+        has one header in front of each run's records.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.header: Header | None = None
+        self._lines: Iterator[Header | Record] = _decoded(path)
+        first = next(self._lines, None)
+        if isinstance(first, Header):
+            self.header = first
+        elif first is not None:
+            self._lines = chain((first,), self._lines)
+
+    def __iter__(self) -> Iterator[Record]:
+        """Return itself."""
+        return self
+
+    def __next__(self) -> Record:
+        """Return the next record; raises SourceError as ``read_records``."""
+        for line in self._lines:
+            if isinstance(line, Record):
+                return line
+            self.header = line
+        raise StopIteration
 
 
-_DECODER = msgspec.json.Decoder(Record)
+def read_records(path: str | os.PathLike[str]) -> Records:
+    """Open a file of JSON lines that ``cvo-edge run`` wrote; also one without a header.
 
-
-def read_records(path: str | PathLike[str]) -> Iterator[Record]:
-    """Yield the records of a file of JSON lines, in its order.
-
-    A last line without its end, of a run that was killed or lost its power or disk, is left out:
-    every line before it is whole, as a record is written at once and its end last.
+    An incomplete last line, left by a run that was killed or lost its power or disk, is skipped:
+    each line is written at once, its end last, so that every line before it is whole.
 
     Raises
     ------
     SourceError
-        The file cannot be read, or a whole line is no record; names the line.
+        The file cannot be read, or a whole line is no record; names the line. Raised at once for
+        the first line, by the iterator for the others.
     """
+    return Records(path)
+
+
+_RECORD = msgspec.json.Decoder(Record)
+_HEADER = msgspec.json.Decoder(Header)
+
+
+class _Kind(Struct):
+    kind: str | None = None
+
+
+_KIND = msgspec.json.Decoder(_Kind)
+
+
+def _decoded(path: str | os.PathLike[str]) -> Iterator[Header | Record]:
     try:
         with Path(path).open("rb") as stream:
             for number, line in enumerate(stream, start=1):
                 if not line.endswith(b"\n"):
                     return
                 try:
-                    record = _DECODER.decode(line)
+                    decoded = _header_or_record(line)
                 except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
                     raise SourceError(
-                        f"{path}: expected a record in line {number}, found none: {error}"
+                        f"{path!s}: expected a record in line {number}, found none: {error}"
                     ) from None
-                yield record
+                yield decoded
     # A ValueError is a name that no file can have.
     except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
+        reason = getattr(error, "strerror", error)
+        raise SourceError(f"{path!s}: cannot be read: {reason}") from None
+
+
+def _header_or_record(line: bytes) -> Header | Record:
+    try:
+        return _RECORD.decode(line)
+    except msgspec.ValidationError:
+        # Records have no key "kind"; a header that is not valid says itself what is wrong.
+        if _KIND.decode(line).kind == "header":
+            return _HEADER.decode(line)
+        raise

@@ -5,21 +5,39 @@ from __future__ import annotations
 import csv
 import fcntl
 import io
-import math
 import os
 import select
 import stat
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from types import TracebackType
 
 import msgspec
 
 from cvo_edge.errors import SinkError, UsageError
-from cvo_edge.estimate import PoseInterval
+from cvo_edge.estimate import BandsOrUnbounded, PoseInterval
+from cvo_edge.output.records import Header
+from cvo_edge.output.table import table_heading, table_line
 from cvo_edge.vocabulary import Format
 
+_SUFFIXES: dict[str, Format] = {".jsonl": "jsonl", ".csv": "csv", ".tum": "tum"}
 _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
+
+
+def format_of(path: str, format: Format | None = None) -> Format:
+    """Return the format of an output: the one asked for, else that of its suffix, else ``jsonl``.
+
+    Raises UsageError where the suffix (``.jsonl``, ``.csv`` or ``.tum``) stands for another format
+    than the one asked for.
+    """
+    of_suffix = _SUFFIXES.get(Path(path).suffix.lower())
+    if format and of_suffix and format != of_suffix:
+        raise UsageError(
+            f"format: expected {of_suffix}, which the name {Path(path).name} stands for, found "
+            f"{format}; change one of them, or leave --format out"
+        )
+    return format or of_suffix or "jsonl"
 
 
 class Sink:
@@ -31,22 +49,29 @@ class Sink:
         Output file, emptied when the first line is written, or ``-`` for standard output.
     format
         ``jsonl``, ``csv``, ``tum`` or, for reading by eye, ``table``.
+    header
+        Written before the first record: as a JSON line, or as lines ``# key: value`` in ``csv`` and
+        ``tum``. None for records of several bundles in one file.
     region
         Put the region's points into the records, where there is one; ``jsonl`` only.
 
     Raises
     ------
     SinkError
-        The file cannot be opened or, later, written; every complete line is kept.
+        The file cannot be opened or, later, written; every complete line is kept, and an incomplete
+        one is removed from a regular file.
     UsageError
         A format whose lines have no place for a region.
     """
 
-    def __init__(self, path: str, format: Format, *, region: bool = False) -> None:
-        self._header, self._line = _FORMATS[format]
+    def __init__(
+        self, path: str, format: Format, header: Header | None = None, *, region: bool = False
+    ) -> None:
+        if region and format != "jsonl":
+            raise UsageError(f"region: expected the format jsonl, found {format}")
+        self._header = header
+        self._heading, self._line = _FORMATS[format]
         if region:
-            if format != "jsonl":
-                raise UsageError(f"region: expected the format jsonl, found {format}")
             self._line = _json_line_with_region
         self._owned = path != "-"
         self._name = path if self._owned else "standard output"
@@ -101,14 +126,14 @@ class Sink:
             # Not before there is something to put in its place.
             if self._owned and stat.S_ISREG(os.fstat(self._descriptor).st_mode):
                 os.ftruncate(self._descriptor, 0)
-            if self._header:
-                self._put(self._header(estimate))
+            line = self._heading(self._header, estimate) + line
         self._put(line)
 
     def _put(self, line: bytes) -> None:
-        while line:
+        written = 0
+        while written < len(line):
             try:
-                line = line[os.write(self._descriptor, line) :]
+                written += os.write(self._descriptor, line[written:] if written else line)
             except BrokenPipeError:
                 raise
             except BlockingIOError:
@@ -117,55 +142,75 @@ class Sink:
                 reader.register(self._descriptor, select.POLLOUT)
                 reader.poll()
             except OSError as error:
+                self._take_back(written)
                 raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
+
+    def _take_back(self, written: int) -> None:
+        """Remove the beginning of a line whose rest cannot be written, where that can be done."""
+        found = os.fstat(self._descriptor)
+        if not written or not stat.S_ISREG(found.st_mode):
+            return
+        end = os.lseek(self._descriptor, 0, os.SEEK_CUR)
+        # Nobody else has written behind it.
+        if end == found.st_size:
+            os.ftruncate(self._descriptor, end - written)
+            os.lseek(self._descriptor, end - written, os.SEEK_SET)
+
+
+def _json_heading(header: Header | None, _: PoseInterval) -> bytes:
+    return b"" if header is None else msgspec.json.encode(header) + b"\n"
 
 
 def _json_line(estimate: PoseInterval) -> bytes:
-    return msgspec.json.encode(estimate.to_dict()) + b"\n"
+    return msgspec.json.encode(estimate.to_record()) + b"\n"
 
 
 def _json_line_with_region(estimate: PoseInterval) -> bytes:
-    return msgspec.json.encode(estimate.to_dict(region=True)) + b"\n"
+    return msgspec.json.encode(estimate.to_record(region=True)) + b"\n"
 
 
-def _csv_header(estimate: PoseInterval) -> bytes:
-    dof = estimate.chart.dof
-    return _csv_row(
-        [
-            *("seq", "stamp_ns", "source", "status", "reasons"),
-            *("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"),
-            *("confidence", "scope", "rotation"),
-            *(f"{name}_lower" for name in dof),
-            *(f"{name}_upper" for name in dof),
-            "bounded",
-            *(f"{name}_bands" for name in dof),
-            *(f"{name}_ms" for name in _CSV_LATENCIES),
-        ]
+def _comments(header: Header | None, _: PoseInterval) -> bytes:
+    """Return the header as lines ``# key: value``: text as it is, everything else as JSON."""
+    fields = {} if header is None else msgspec.to_builtins(header)
+    lines = (
+        f"# {key}: {value if isinstance(value, str) else msgspec.json.encode(value).decode()}\n"
+        for key, value in fields.items()
     )
+    return "".join(lines).encode()
+
+
+def _csv_heading(header: Header | None, estimate: PoseInterval) -> bytes:
+    dof = estimate.chart.dof
+    columns = [
+        *("seq", "stamp_ns", "source", "status", "reasons"),
+        *("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"),
+        *("confidence", "scope", "rotation"),
+        *(f"{name}_lower" for name in dof),
+        *(f"{name}_upper" for name in dof),
+        "bounded",
+        *(f"{name}_bands" for name in dof),
+        *(f"{name}_ms" for name in _CSV_LATENCIES),
+    ]
+    return _comments(header, estimate) + _csv_row(columns)
 
 
 def _csv_line(estimate: PoseInterval) -> bytes:
-    record = estimate.to_dict()
-    pose, interval = record["pose"], record["interval"]
-    return _csv_row(
-        [
-            *(record["seq"], record["stamp_ns"], record["source"], str(record["status"])),
-            " ".join(record["reasons"]),
-            *([*pose["t_m"], *pose["q_xyzw"]] if pose else [None] * 7),
-            *(record["interval"][key] if interval else None for key in _INTERVAL_KEYS),
-            *(interval["lower"] if interval else [None] * 6),
-            *(interval["upper"] if interval else [None] * 6),
-            interval["bounded"] if interval else None,
-            *(_csv_bands(interval["bands"]) if interval and interval["bands"] else [None] * 6),
-            *(record["latency_ms"].get(stage) for stage in _CSV_LATENCIES),
-        ]
-    )
+    record = estimate.to_record()
+    pose, interval = record.pose, record.interval
+    row: list[object] = [record.seq, record.stamp_ns, record.source, str(record.status)]
+    row.append(" ".join(record.reasons))
+    row += [*pose.t_m, *pose.q_xyzw] if pose else [None] * 7
+    if interval:
+        row += [interval.confidence, interval.scope, interval.rotation]
+        row += [*interval.lower, *interval.upper, interval.bounded]
+        row += _csv_bands(interval.bands) if interval.bands else [None] * 6
+    else:
+        row += [None] * 22
+    row += [record.latency_ms.get(stage) for stage in _CSV_LATENCIES]
+    return _csv_row(row)
 
 
-_INTERVAL_KEYS = ("confidence", "scope", "rotation")
-
-
-def _csv_bands(bands: Iterable[Iterable[tuple[float, float]]]) -> list[str]:
+def _csv_bands(bands: BandsOrUnbounded) -> list[str]:
     return [" ".join(f"{low!r}:{high!r}" for low, high in dof) for dof in bands]
 
 
@@ -191,38 +236,12 @@ def _tum_line(estimate: PoseInterval) -> bytes:
     return f"{sign}{seconds}.{rest:09d} {numbers}\n".encode()
 
 
-def _table_header(estimate: PoseInterval) -> bytes:
-    names = "".join(
-        f"{name + unit:>21}" for name, unit in zip(estimate.chart.dof, _UNITS, strict=True)
-    )
-    return f"{'frame':<26}{'status':<9}{names}\n".encode()
-
-
-def _table_line(estimate: PoseInterval) -> bytes:
-    # A file's name may move a terminal's cursor.
-    name = "".join(c if c.isprintable() else "?" for c in estimate.source or str(estimate.seq))
-    name = name[-25:]
-    line = f"{name:<26}{estimate.status:<9}"
-    if estimate.pose is None:
-        return f"{line}  {', '.join(estimate.reasons)}\n".encode()
-    pieces = [len(row) for row in estimate.bands] if estimate.bands else [1] * 6
-    for low, high, scale, bands in zip(
-        estimate.lower.tolist(), estimate.upper.tolist(), _SCALES, pieces, strict=True
-    ):
-        finite = high - low < float("inf")
-        cell = f"{scale * low:.1f} .. {scale * high:.1f}" if finite else "unbounded"
-        # A set in pieces shows its hull and, in brackets, how many there are.
-        line += f"{cell if bands == 1 else f'{cell} ({bands})':>21}"
-    return f"{line}\n".encode()
-
-
-_UNITS = (" cm",) * 3 + (" deg",) * 3
-_SCALES = (100.0,) * 3 + (math.degrees(1.0),) * 3
-
-_LineWriter = Callable[[PoseInterval], bytes]
-_FORMATS: dict[Format, tuple[_LineWriter | None, _LineWriter]] = {
-    "jsonl": (None, _json_line),
-    "csv": (_csv_header, _csv_line),
-    "tum": (None, _tum_line),
-    "table": (_table_header, _table_line),
+_FORMATS: dict[
+    Format,
+    tuple[Callable[[Header | None, PoseInterval], bytes], Callable[[PoseInterval], bytes]],
+] = {
+    "jsonl": (_json_heading, _json_line),
+    "csv": (_csv_heading, _csv_line),
+    "tum": (_comments, _tum_line),
+    "table": (lambda _, estimate: table_heading(estimate), table_line),
 }

@@ -108,8 +108,14 @@ def run(
         typer.Option("-o", "--output", help="File, or - for stdout.", rich_help_panel=_REPORT),
     ] = "-",
     format: Annotated[
-        Format, typer.Option(help="Format of the records.", rich_help_panel=_REPORT)
-    ] = "jsonl",
+        Format | None,
+        typer.Option(
+            help="Format of the records; default: by the file's suffix (.jsonl, .csv, .tum), else "
+            "jsonl.",
+            show_default=False,
+            rich_help_panel=_REPORT,
+        ),
+    ] = None,
     region: Annotated[
         bool,
         typer.Option(
@@ -178,11 +184,13 @@ def run(
     from cvo_edge.input.capture import shown
     from cvo_edge.input.sources import open_source
     from cvo_edge.odometer import Odometer
-    from cvo_edge.output.sinks import Sink
+    from cvo_edge.output.records import header_of
+    from cvo_edge.output.sinks import Sink, format_of
     from cvo_edge.programs.progress import frames_progress
     from cvo_edge.programs.run import RunSummary
     from cvo_edge.programs.run import run as run_frames
 
+    written_as = format_of(output, format)
     _refuse_overwriting(output, source, ground_truth, bundle, public_key)
     truth = open_ground_truth(ground_truth) if ground_truth else None
     frames = open_source(source, fps, timeout)
@@ -202,7 +210,14 @@ def run(
             )
         summary = RunSummary(odometer.chart.dof, confidence, scope, with_truth=truth is not None)
         watched = output != "-" and not quiet
-        with Sink(output, format, region=region) as sink:
+        header = header_of(
+            odometer.calibration,
+            odometer.chart,
+            odometer.confidence,
+            scope,
+            stamps="fps" if fps else "arrival" if frames.live else None,
+        )
+        with Sink(output, written_as, header, region=region) as sink:
             try:
                 with frames_progress(watched, summary, frames.length, max_frames) as tick:
                     run_frames(

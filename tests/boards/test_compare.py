@@ -3,6 +3,7 @@
 import copy
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -12,9 +13,9 @@ from boards.compare import (
     difference,
     exceeded,
     mean_width,
-    parse_records,
+    stacked,
 )
-from cvo_edge import geometry
+from cvo_edge import Record, geometry
 from cvo_edge.pose import Chart
 
 TOLERANCE = Tolerance(share=0.05, moved_share=0.1)
@@ -28,7 +29,12 @@ def record(number=0, half_width=0.5, bands=None):
         "source": f"{number}.jpg",
         "status": "ok",
         "pose": {"t_m": [0.0, 0.0, 0.0], "q_xyzw": IDENTITY},
-        "interval": {"lower": [-half_width] * 6, "upper": [half_width] * 6, "bands": bands},
+        "interval": {
+            "lower": [-half_width] * 6,
+            "upper": [half_width] * 6,
+            "bands": bands,
+            "bounded": True,
+        },
     }
 
 
@@ -36,8 +42,20 @@ def invalid(number=0):
     return {"source": f"{number}.jpg", "status": "invalid", "pose": None, "interval": None}
 
 
+def run_of(lines):
+    """Records with what these tests look at, and values for the rest of their keys."""
+    rest = {"seq": 0, "stamp_ns": None, "reasons": [], "latency_ms": {}}
+    chart = {"confidence": 0.9, "scope": "marginal", "rotation": "tangent_reference"}
+    return stacked(
+        msgspec.convert(
+            rest | line | {"interval": line["interval"] and chart | line["interval"]}, Record
+        )
+        for line in lines
+    )
+
+
 def compared(first, second, tolerance=TOLERANCE):
-    return difference(parse_records(first), parse_records(second), tolerance)
+    return difference(run_of(first), run_of(second), tolerance)
 
 
 def test_a_run_does_not_differ_from_itself_whatever_is_in_it():
@@ -109,7 +127,7 @@ def test_few_sets_with_bands_may_change_as_a_class_enters_or_leaves():
 
 def test_a_gap_is_no_width():
     gap = [[[-0.5, -0.1], [0.1, 0.5]]] * 6
-    assert mean_width(parse_records([record(bands=gap)])) == pytest.approx(np.full(6, 0.8))
+    assert mean_width(run_of([record(bands=gap)])) == pytest.approx(np.full(6, 0.8))
 
 
 def test_other_frames_are_refused():
@@ -124,7 +142,7 @@ def test_coverage_is_the_share_of_frames_whose_set_holds_the_truth():
         "2.jpg": np.array([0.0, 0.0, 0.0, *IDENTITY]),
     }
     # Number 2 has no pose, number 3 no truth.
-    run = parse_records([record(0), record(1), invalid(2), record(3)])
+    run = run_of([record(0), record(1), invalid(2), record(3)])
     found = coverage(run, CHART, truth)
     assert found == {"frames": 2, "per_dof": [0.5, 1.0, 1.0, 1.0, 1.0, 1.0], "all_six": 0.5}
 
@@ -132,4 +150,4 @@ def test_coverage_is_the_share_of_frames_whose_set_holds_the_truth():
 def test_the_truth_in_a_gap_is_not_covered():
     gap = [[[-0.5, -0.1], [0.1, 0.5]], *[[[-0.5, 0.5]]] * 5]
     truth = {"0.jpg": np.array([0.0, 0.0, 0.0, *IDENTITY])}
-    assert coverage(parse_records([record(bands=gap)]), CHART, truth)["per_dof"][0] == 0.0
+    assert coverage(run_of([record(bands=gap)]), CHART, truth)["per_dof"][0] == 0.0

@@ -42,10 +42,17 @@ def refused(result, code):
     return lines[0]
 
 
+def records_in(output):
+    """Decoded JSON lines of a run, its header left out."""
+    header, *records = map(json.loads, output.splitlines())
+    assert header["kind"] == "header"
+    return records
+
+
 def test_run_and_ten_lines_of_python_give_equal_numbers(bundle_dir, clip_dir):
     result = cvo_edge("run", bundle_dir, clip_dir, "--max-frames", 5)
     assert result.returncode == 0
-    records = [json.loads(line) for line in result.stdout.splitlines()]
+    records = records_in(result.stdout)
     with Odometer.load(bundle_dir) as odometer:
         for record, estimate in zip(
             records, odometer.stream(list(open_source(str(clip_dir)))[:5]), strict=True
@@ -63,7 +70,7 @@ def test_summary_has_coverage_where_there_is_ground_truth(bundle_dir, clip_dir, 
     assert result.stdout == ""
     assert "coverage" in result.stderr
     frames = len(list(clip_dir.glob("*.color.jpg")))
-    assert len(out.read_text().splitlines()) == frames
+    assert len(records_in(out.read_text())) == frames
     assert f"of {frames} frames" in result.stderr
 
 
@@ -72,15 +79,28 @@ def test_the_region_is_recorded_on_request_and_only_where_there_is_one(bundle_di
     joint = ("--scope", "joint", "--region", "--quiet")
     result = cvo_edge("run", regions, clip_dir, "--max-frames", 2, *joint)
     assert result.returncode == 0
-    for line in result.stdout.splitlines():
-        interval = json.loads(line)["interval"]
+    for record in records_in(result.stdout):
+        interval = record["interval"]
         assert interval["region"].keys() == {"radius", "scale", "centres"}
         assert len(interval["region"]["centres"]) > 1
     unbounded = cvo_edge("run", regions, clip_dir, *joint, "--max-frames", 1, "--confidence", 0.99)
-    assert json.loads(unbounded.stdout)["interval"]["region"] is None
+    assert records_in(unbounded.stdout)[0]["interval"]["region"] is None
     assert "expected a bundle of mcqr" in refused(cvo_edge("run", regions, clip_dir, "--region"), 2)
     refused(cvo_edge("run", bundle_dir, clip_dir, *joint), 2)
     assert "jsonl" in refused(cvo_edge("run", regions, clip_dir, *joint, "--format", "csv"), 2)
+
+
+def test_the_suffix_of_the_output_chooses_the_format(bundle_dir, clip_dir, tmp_path):
+    options = ("--max-frames", 1, "--quiet", "--fps", 30, "-o")
+    output = tmp_path / "a.tum"
+    assert cvo_edge("run", bundle_dir, clip_dir, *options, output).returncode == 0
+    assert np.loadtxt(output).shape == (8,)
+    assert "# stamps: fps\n" in output.read_text()
+    content = output.read_bytes()
+    assert "--format" in refused(
+        cvo_edge("run", bundle_dir, clip_dir, *options, output, "--format", "csv"), 2
+    )
+    assert output.read_bytes() == content
 
 
 def test_quiet_is_quiet(bundle_dir, clip_dir):
@@ -141,7 +161,7 @@ def test_a_signal_ends_it_with_every_record_whole(
         assert process.stderr.read() == b""
     content = out.read_text()
     assert content.endswith("\n")
-    sequence = [json.loads(line)["seq"] for line in content.splitlines()]
+    sequence = [record["seq"] for record in records_in(content)]
     if mode == "live":  # what the network was too slow for is missing
         assert sequence == sorted(set(sequence))
     else:
@@ -153,38 +173,39 @@ def test_killed_without_warning_loses_no_acknowledged_record(bundle_dir, clip_di
     with subprocess.Popen(
         [*CVO_EDGE, "run", str(bundle_dir), str(clip_dir), "--quiet"], stdout=subprocess.PIPE
     ) as process:
-        first = process.stdout.readline()
+        header, first = process.stdout.readline(), process.stdout.readline()
         process.kill()
         rest = process.stdout.read()
+    assert json.loads(header)["kind"] == "header"
     assert json.loads(first)["seq"] == 0
     complete = rest.decode().splitlines()[: rest.count(b"\n")]
     assert [json.loads(line)["seq"] for line in complete] == list(range(1, len(complete) + 1))
 
 
-@pytest.mark.parametrize("format", ["jsonl", "csv"])
-def test_a_disk_that_fills_up_within_a_line_keeps_every_line_before_it(
+@pytest.mark.parametrize("format", ["jsonl", "csv", "tum", "table"])
+def test_a_disk_that_fills_up_within_a_line_keeps_every_line_before_it_and_no_part_of_it(
     bundle_dir, clip_dir, tmp_path, format
 ):
-    output, limit = tmp_path / "records", 9000
+    # So that ever another byte of a line is the first that does not fit.
+    for limit in (2500, 2501, 2550):
+        output = tmp_path / f"records-{limit}"
 
-    def small_disk():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        def small_disk(limit=limit):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    result = cvo_edge(
-        *("run", bundle_dir, clip_dir, "-o", output, "--format", format, "--no-cache", "--quiet"),
-        preexec_fn=small_disk,
-    )
-    assert str(output) in refused(result, 7)
-    content = output.read_bytes()
-    assert 0 < len(content) <= limit
-    whole = cvo_edge("run", bundle_dir, clip_dir, "--format", format, "--quiet").stdout.splitlines()
-    kept = content.decode().splitlines()[: content.count(b"\n")]
-    assert len(kept) > 5
-    if format == "jsonl":
-        names = [record.source for record in read_records(output)]
-        assert names == [json.loads(line)["source"] for line in whole[: len(kept)]]
-    else:
-        assert [line.count(",") for line in kept] == [whole[0].count(",")] * len(kept)
+        result = cvo_edge(
+            *("run", bundle_dir, clip_dir, "-o", output, "--format", format, "--fps", 30),
+            *("--no-cache", "--quiet"),
+            preexec_fn=small_disk,
+        )
+        assert str(output) in refused(result, 7)
+        content = output.read_bytes()
+        assert content.endswith(b"\n")
+        assert 1000 < len(content) <= limit
+        if format == "jsonl":
+            assert [record.seq for record in read_records(output)] == list(
+                range(content.count(b"\n") - 1)
+            )
 
 
 def test_a_slow_reader_is_waited_for_also_where_another_process_would_not(bundle_dir, clip_dir):
@@ -198,7 +219,7 @@ def test_a_slow_reader_is_waited_for_also_where_another_process_would_not(bundle
             time.sleep(2.0)
             lines = stream.readlines()
         assert process.wait(60) == 0, process.stderr.read()
-    assert len(lines) == 40
+    assert len(lines) == 1 + 40
 
 
 def test_closed_or_full_standard_output_is_exit_7(bundle_dir):
@@ -358,7 +379,7 @@ def test_exit_6_for_a_source_that_gives_nothing(bundle_dir, tmp_path):
         (tmp_path / f"{index}.png").write_bytes(b"\x89PNG damaged")
     result = cvo_edge("run", bundle_dir, tmp_path, "--quiet")
     refused(result, 6)
-    assert [json.loads(line)["status"] for line in result.stdout.splitlines()] == ["invalid"] * 2
+    assert [record["status"] for record in records_in(result.stdout)] == ["invalid"] * 2
 
 
 def test_exit_6_for_a_video_cut_short_with_its_records_kept(bundle_dir, tmp_path):
@@ -376,7 +397,7 @@ def test_exit_6_for_a_video_cut_short_with_its_records_kept(bundle_dir, tmp_path
     if "opens" in result.stderr:
         pytest.skip("this OpenCV opens no video without its index")
     assert "of 30" in refused(result, 6)
-    assert len(result.stdout.splitlines()) > 0
+    assert len(result.stdout.splitlines()) > 1
 
 
 def test_exit_7_for_an_output_that_cannot_be_written(bundle_dir, clip_dir, tmp_path):
@@ -476,7 +497,7 @@ def test_the_exit_code_is_the_same_where_nobody_reads_stderr(bundle_dir, clip_di
     os.close(sender)
     assert done.returncode == code
     # Nor does what was meant for it go among the records.
-    assert all(json.loads(line)["seq"] >= 0 for line in done.stdout.splitlines())
+    assert all(json.loads(line)["seq"] >= 0 for line in done.stdout.splitlines()[1:])
 
 
 @pytest.mark.parametrize("command", ["run", "verify", "inspect", "bench"])

@@ -2,15 +2,39 @@
 
 import csv
 import dataclasses
+import errno
 import json
+import os
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from cvo_edge import Odometer, SinkError, UsageError, open_source
-from cvo_edge.output.sinks import Sink
+from cvo_edge import (
+    ConformalSet,
+    Odometer,
+    Pose,
+    Reason,
+    SinkError,
+    Status,
+    UsageError,
+    open_source,
+)
+from cvo_edge.ground_truth import open_ground_truth
+from cvo_edge.output.records import header_of
+from cvo_edge.output.sinks import Sink, format_of
+from cvo_edge.pose import Chart
 from cvo_edge.sets import unbounded_set
+
+
+@pytest.fixture(scope="module")
+def header(bundle):
+    pose = bundle.calibration.pose
+    chart = Chart(pose.rotation, np.array(pose.reference_q_xyzw))
+    return header_of(bundle.calibration, chart, 0.9, "marginal")
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +45,8 @@ def estimates(bundle_dir, clip_dir):
         return [*good, odometer.step(None, stamp_ns=99_000_000, source="lost.png")]
 
 
-def write(path, format, estimates):
-    with Sink(str(path), format) as sink:
+def write(path, format, estimates, header=None):
+    with Sink(str(path), format, header) as sink:
         for estimate in estimates:
             sink.write(estimate)
     return path.read_text()
@@ -50,8 +74,16 @@ def test_json_lines_are_the_record(tmp_path, estimates):
     assert lost["reasons"] == ["image_unreadable"]
 
 
-def test_csv_holds_the_same_numbers(tmp_path, estimates):
-    rows = list(csv.DictReader(write(tmp_path / "a.csv", "csv", estimates).splitlines()))
+def test_csv_holds_the_same_numbers(tmp_path, estimates, header):
+    lines = write(tmp_path / "a.csv", "csv", estimates, header).splitlines()
+    comments = [line for line in lines if line.startswith("# ")]
+    assert lines[: len(comments)] == comments
+    pairs = dict(line[2:].split(": ", 1) for line in comments)
+    said = msgspec.to_builtins(header)
+    assert pairs.keys() == said.keys()
+    assert pairs["bundle"] == header.bundle
+    assert tuple(json.loads(pairs["reference_q_xyzw"])) == header.reference_q_xyzw
+    rows = list(csv.DictReader(lines[len(comments) :]))
     assert len(rows) == len(estimates)
     first = estimates[0]
     assert [float(rows[0][f"{dof}_lower"]) for dof in first.chart.dof] == first.lower.tolist()
@@ -60,8 +92,14 @@ def test_csv_holds_the_same_numbers(tmp_path, estimates):
     assert rows[-1]["reasons"] == "image_unreadable"
 
 
-def test_tum_has_eight_columns_and_skips_what_has_no_pose(tmp_path, estimates):
-    lines = write(tmp_path / "a.txt", "tum", estimates).splitlines()
+def test_tum_has_eight_columns_and_skips_what_has_no_pose(tmp_path, estimates, header):
+    path = tmp_path / "a.txt"
+    text = write(path, "tum", estimates, header)
+    assert f"# frame_id: {header.frame_id}\n" in text
+    assert np.loadtxt(path).shape == (3, 8)
+    truth = open_ground_truth(path)
+    np.testing.assert_allclose(truth.pose_of(estimates[1]), estimates[1].pose.to_array(), atol=1e-8)
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
     assert len(lines) == 3
     assert all(len(line.split()) == 8 for line in lines)
     assert lines[1].split()[0] == "0.033333333"
@@ -84,9 +122,120 @@ def test_tum_without_stamps_is_refused(tmp_path, bundle_dir, clip_dir):
         sink.write(estimate)
 
 
-def test_table_says_unbounded_in_words(tmp_path, estimates):
-    wide = [dataclasses.replace(estimates[0], conformal_set=unbounded_set())]
-    assert write(tmp_path / "a.txt", "table", wide).count("unbounded") == 6
+def table(path, estimates):
+    """Heading and rows of a table; no line is wider than a terminal."""
+    lines = write(path, "table", estimates).splitlines()
+    assert all(len(line) <= 80 for line in lines)
+    return lines[:4], lines[4:]
+
+
+@pytest.mark.parametrize("method", ["cjp", "cqr", "csp", "mcqr"])
+def test_a_table_has_positions_and_half_widths_whatever_the_chart(
+    tmp_path, artifacts_dir, clip_dir, method
+):
+    frames = list(open_source(str(clip_dir)))[:4]
+    with Odometer.load(artifacts_dir / f"synthetic-room-{method}", threads=1) as odometer:
+        estimates = list(odometer.stream(frames))
+    heading, rows = table(tmp_path / "a.txt", estimates)
+    assert "0.9 (marginal)" in heading[1]
+    assert heading[2].split() == ["frame", "status", "tx", "ty", "tz", *estimates[0].chart.dof]
+    for row, estimate in zip(rows, estimates, strict=True):
+        name, status, *numbers = row.split()
+        assert (name, status) == (estimate.source.split(".")[0], "ok")
+        np.testing.assert_allclose([float(n) for n in numbers[:3]], estimate.pose.t_m, atol=5e-4)
+        half = 0.5 * (estimate.upper - estimate.lower)
+        half = np.concatenate([100 * half[:3], np.rad2deg(half[3:])])
+        found = [float(n.strip("±*")) for n in numbers[3:]]
+        np.testing.assert_allclose(found, half, atol=0.0501)
+        pieces = [len(row) > 1 for row in estimate.bands or [()] * 6]
+        assert [n.endswith("*") for n in numbers[3:]] == pieces
+
+
+@given(
+    st.lists(st.floats(-1e9, 1e9), min_size=3, max_size=3),
+    st.lists(st.floats(0.0, 1e9), min_size=6, max_size=6),
+    st.booleans(),
+)
+def test_no_number_breaks_the_columns_of_a_table(estimates, tmp_path_factory, t_m, half, pieces):
+    half = np.array(half)
+    bands = (((-1.0, -0.5), (0.5, 1.0)),) * 6 if pieces else None
+    large = dataclasses.replace(
+        estimates[0],
+        pose=Pose(np.array(t_m), np.array([0.0, 0.0, 0.0, 1.0])),
+        conformal_set=ConformalSet(-half, half, bands),
+    )
+    _, (row,) = table(tmp_path_factory.getbasetemp() / "large.txt", [large])
+    for value, (begin, end) in zip(t_m, ((21, 29), (29, 37), (37, 44)), strict=True):
+        assert row[begin] == " "
+        assert float(row[begin:end]) == pytest.approx(value, rel=0.06, abs=5e-4)
+    cells = [row[begin : begin + 6] for begin in range(44, 80, 6)]
+    assert [cell.strip()[0] for cell in cells] == ["±"] * 6
+    cm_or_deg = half * ([100.0] * 3 + [np.rad2deg(1.0)] * 3)
+    found = [float(cell.strip(" ±*")) for cell in cells]
+    # One digit is left of numbers with an exponent.
+    np.testing.assert_allclose(found, cm_or_deg, rtol=0.34, atol=0.0501)
+    assert [cell.endswith("*") for cell in cells] == [pieces] * 6
+
+
+def test_a_table_of_a_world_in_utm_keeps_the_metres(tmp_path, estimates):
+    pose = Pose(np.array([500_123.456, 5_412_345.678, 312.3]), estimates[0].pose.q_xyzw)
+    _, (row,) = table(tmp_path / "a.txt", [dataclasses.replace(estimates[0], pose=pose)])
+    assert row.split()[2:5] == ["500123", "5412346", "312.30"]
+
+
+def test_a_table_says_where_nothing_is_bounded_and_why(tmp_path, estimates):
+    wide = dataclasses.replace(estimates[0], conformal_set=unbounded_set())
+    degraded = dataclasses.replace(
+        wide, status=Status.DEGRADED, reasons=(Reason.IMAGE_BLACK, Reason.FRAME_STALE)
+    )
+    many = dataclasses.replace(degraded, reasons=tuple(Reason))
+    _, rows = table(tmp_path / "a.txt", [wide, degraded, many, estimates[-1]])
+    assert rows[0].split()[-6:] == ["inf"] * 6
+    assert rows[1].endswith(" image_black, frame_stale")
+    assert rows[2].endswith(f" +{len(Reason) - 1}")
+    assert rows[3].split() == ["lost", "invalid", "image_unreadable"]
+
+
+@pytest.mark.parametrize(
+    ("source", "shown"),
+    [
+        ("frame-000007.color.jpg", "frame-000007"),
+        ("1305031102.175304.png", "31102.175304"),
+        ("a-rather-long-name-0042.jpeg", "ng-name-0042"),
+        ("clip.avi#1234", "lip.avi#1234"),
+        ("图像图像图像图像-0001.jpg", "像图像-0001"),
+        (".jpg", ".jpg"),
+        ("", "0"),
+    ],
+)
+def test_a_table_keeps_the_end_of_a_name(tmp_path, estimates, source, shown):
+    _, (row,) = table(tmp_path / "a.txt", [dataclasses.replace(estimates[0], source=source)])
+    assert row.split()[0] == shown
+
+
+@pytest.mark.parametrize(
+    ("name", "format", "expected"),
+    [
+        ("a.jsonl", None, "jsonl"),
+        ("a.csv", None, "csv"),
+        ("a.b/A.TUM", None, "tum"),
+        ("a.txt", None, "jsonl"),
+        ("-", None, "jsonl"),
+        ("a.csv", "csv", "csv"),
+        ("a.txt", "tum", "tum"),
+        ("csv", "table", "table"),
+    ],
+)
+def test_a_suffix_chooses_the_format_unless_it_is_given(name, format, expected):
+    assert format_of(name, format) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "format"), [("a.csv", "jsonl"), ("a.JSONL", "table"), ("a.tum", "csv")]
+)
+def test_a_suffix_that_contradicts_the_format_is_refused(name, format):
+    with pytest.raises(UsageError, match=rf"{name}.*{format}"):
+        format_of(name, format)
 
 
 def test_an_old_file_is_kept_until_there_is_a_line_to_put_in_its_place(tmp_path, estimates):
@@ -112,9 +261,40 @@ def test_a_full_disk_is_a_sink_error(estimates):
 
 def test_a_table_is_one_line_a_frame_whatever_a_file_is_called(tmp_path, estimates):
     named = dataclasses.replace(estimates[0], source="x\x1b[2J\nframe-9  ok.jpg")
-    lines = write(tmp_path / "a.txt", "table", [named]).splitlines()
-    assert len(lines) == 2
-    assert lines[1].isprintable()
+    _, rows = table(tmp_path / "a.txt", [named])
+    assert len(rows) == 1
+    assert rows[0].isprintable()
+
+
+@pytest.mark.parametrize("format", ["jsonl", "csv", "tum", "table"])
+@pytest.mark.parametrize("fits", [1, 50, 80])
+def test_a_line_that_fits_in_part_only_is_taken_back(
+    tmp_path, monkeypatch, estimates, header, format, fits
+):
+    path = tmp_path / "a"
+    with Sink(str(path), format, header) as sink:
+        sink.write(estimates[0])
+        whole = path.read_bytes()
+        real, rest = os.write, [fits]
+
+        def full(descriptor, line):
+            if rest[0] == 0:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            line, rest[0] = line[: rest[0]], max(0, rest[0] - len(line))
+            return real(descriptor, line)
+
+        monkeypatch.setattr(os, "write", full)
+        with pytest.raises(SinkError, match="No space left"):
+            sink.write(estimates[1])
+        monkeypatch.undo()
+        assert path.read_bytes() == whole
+        # Room was made: it goes on behind the last whole line.
+        sink.write(estimates[2])
+    assert (
+        path.read_bytes()
+        == whole
+        + write(tmp_path / "b", format, [estimates[2]]).encode().splitlines(keepends=True)[-1]
+    )
 
 
 def test_one_file_has_one_writer(tmp_path, estimates):
