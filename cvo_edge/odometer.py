@@ -27,10 +27,12 @@ from cvo_edge.errors import ModelError, UsageError
 from cvo_edge.estimate import PoseInterval, Reason, Status
 from cvo_edge.heads.checked import consistent_head
 from cvo_edge.input import preprocess
+from cvo_edge.input.clock import SYSTEM_CLOCK
 from cvo_edge.input.frame import Frame, Source
 from cvo_edge.input.frame_checks import Look, StreamChecks, image_doubt
+from cvo_edge.input.newest import Newest, Played
 from cvo_edge.pose import Chart, Pose
-from cvo_edge.scheduling import Mode, Newest, Played, checked_mode, in_order, plan
+from cvo_edge.scheduling import Mode, checked_mode, in_order, plan
 from cvo_edge.sets import ConformalSet, Scope, unbounded_set
 
 Array = NDArray[np.float64]
@@ -65,7 +67,7 @@ class _Estimated(NamedTuple):
 
     estimate: PoseInterval
     look: Look | None
-    waited_ms: float
+    frame: Frame
 
 
 class _Settings(TypedDict):
@@ -144,6 +146,7 @@ class Odometer:
             self._limits_chart = Chart("tangent_reference", np.array(reference))
         self._limits = calibration.pose.limits
         self._stream_checks = StreamChecks()
+        self._clock = SYSTEM_CLOCK
         self._stepping = Lock()
         self._seq = 0
 
@@ -277,11 +280,11 @@ class Odometer:
 
     def _newest(self, frames: Iterable[Frame | NDArray[Any]]) -> Iterator[PoseInterval]:
         if isinstance(frames, Source):
-            coming = frames if frames.live else Played(frames)
+            coming = frames if frames.live else Played(frames, self._clock)
             # Sources of others need not have it.
-            newest = Newest(coming, getattr(coming, "stop", None))
+            newest = Newest(coming, getattr(coming, "stop", None), self._clock)
         else:
-            newest = Newest(map(_kept, frames))
+            newest = Newest(map(_kept, frames), clock=self._clock)
         with closing(iter(newest)) as frames_in_time:
             yield from self._one_by_one(frames_in_time)
 
@@ -308,6 +311,7 @@ class Odometer:
         return seq
 
     def _estimate(self, frame: Frame, seq: int) -> _Estimated:
+        waited_ms = frame.since_arrival_ms(self._clock.now_s())
         start = perf_counter()
         observation = self.observe(frame.image, seq)
         concluded = perf_counter()
@@ -332,15 +336,17 @@ class Odometer:
                 "preprocess": round(observation.preprocess_ms, 4),
                 "model": round(observation.model_ms, 4),
                 "conformal": round(1e3 * (end - concluded), 4),
-                "total": round(frame.read_ms + frame.waited_ms + 1e3 * (end - start), 4),
+                "total": round(max(frame.read_ms, waited_ms) + 1e3 * (end - start), 4),
             },
         )
-        return _Estimated(estimate, observation.look, frame.waited_ms)
+        return _Estimated(estimate, observation.look, frame)
 
     def _in_stream(self, estimated: _Estimated) -> PoseInterval:
         """Take back what the frames before an estimate's speak against; they come in order."""
-        estimate, look, waited_ms = estimated
-        doubts = self._stream_checks.doubts(look, estimate.stamp_ns, waited_ms)
+        estimate, look, frame = estimated
+        # The age counts until the estimate is given: a process may be stopped at any point.
+        age_ms = frame.age_ms(self._clock.now_s())
+        doubts = self._stream_checks.doubts(look, estimate.stamp_ns, age_ms)
         if not doubts:
             return estimate
         if estimate.status is Status.OK:
