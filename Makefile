@@ -8,11 +8,12 @@ METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 CLIP := calibration_artifacts/synthetic-room-clip
 
-.PHONY: help demo test check bench soak fuzz arm64 avx2 format clean
+.PHONY: help demo test coverage check bench soak fuzz arm64 avx2 format clean
 
 help:
 	@echo "make demo    install the runtime alone and run the demonstration bundles on a sample clip"
 	@echo "make test    install both packages and run the test-suite (CVO_DATA: real data, optional)"
+	@echo "make coverage run the test-suite and show the lines of cvo_edge that none of it runs"
 	@echo "make arm64   test the runtime on an emulated 64-bit ARM, and compare its numbers with this machine's"
 	@echo "make avx2    the same on an x86-64 without VNNI (both: Linux with apt-get, as root for the emulator)"
 	@echo "make check   lint, formatting, types and import rules"
@@ -50,6 +51,10 @@ demo-%: $(DEMO_VENV)/.installed
 
 test: $(VENV)/.installed .opencv4
 	$(VENV)/bin/python -m pytest
+
+# Processes that the tests start are measured, too; below 95 % of all lines it fails.
+coverage: $(VENV)/.installed .opencv4
+	$(VENV)/bin/python -m pytest --cov --cov-report=term-missing
 
 arm64 avx2: $(VENV)/.installed
 	$(VENV)/bin/python -m boards $@ --json bench/results/boards/$@.json
