@@ -1,4 +1,4 @@
-"""How streams use the cores: order, errors in their place, the newest frame."""
+"""Scheduling of streams: order, errors in their place, the newest frame."""
 
 import json
 import subprocess
@@ -19,7 +19,7 @@ from cvo_edge.scheduling import Mode, in_order, plan
 HANGS_S = 120.0
 
 
-def test_each_mode_uses_as_many_threads_as_it_is_given():
+def test_each_mode_uses_the_threads_it_is_given():
     for mode in Mode:
         settings = plan(mode, 2)
         assert settings.threads * settings.workers == 2
@@ -199,10 +199,8 @@ def test_nothing_reads_on_when_a_live_stream_is_left(bundle_dir):
     assert readers() == []
 
 
-def test_a_video_that_is_left_while_it_is_read_ends_the_process_as_ever(
-    bundle_dir, clip_dir, tmp_path
-):
-    # Large: most of the time the reader is inside of OpenCV.
+def test_a_process_exits_cleanly_while_a_video_is_being_read(bundle_dir, clip_dir, tmp_path):
+    # Large, so that the reader is inside OpenCV most of the time.
     frame = next(iter(open_source(str(clip_dir))))
     path = tmp_path / "large.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (2560, 1920))
@@ -215,7 +213,7 @@ def test_a_video_that_is_left_while_it_is_read_ends_the_process_as_ever(
     assert (done.returncode, done.stderr, len(done.stdout.splitlines())) == (0, "", 2)
 
 
-def test_what_cannot_be_played_is_refused(bundle_dir, clip_dir):
+def test_a_recording_without_stamps_is_not_played_live(bundle_dir, clip_dir):
     odometer = Odometer.load(bundle_dir, mode="live")
     with pytest.raises(UsageError, match="the frames have no stamps"):
         list(odometer.stream(open_source(str(clip_dir))))
