@@ -10,7 +10,7 @@ METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 RUNTIME := $(shell find cvo_edge -type f -not -name "*.pyc")
 
-.PHONY: help demo test check bench soak fuzz arm64 avx2 format clean
+.PHONY: help demo test coverage check bench soak fuzz arm64 avx2 format clean
 
 help: ## list all targets
 	@awk -F ':.*## ' '/^[a-z0-9 -]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -43,6 +43,10 @@ demo-%: $(DEMO_VENV)/.installed
 
 test: $(VENV)/.installed .opencv4 ## install both packages and run all tests (CVO_DATA, CVO_WEIGHTS: optional real data)
 	$(VENV)/bin/python -m pytest
+
+# Processes that the tests start are measured, too; below 95 % of all lines it fails.
+coverage: $(VENV)/.installed .opencv4 ## run all tests and list the lines of cvo_edge that no test runs
+	$(VENV)/bin/python -m pytest --cov --cov-report=term-missing
 
 arm64 avx2: $(VENV)/.installed ## test the runtime on an emulated processor and compare the numbers (Linux, apt-get, root)
 	$(VENV)/bin/python -m boards $@ --json bench/results/boards/$@.json

@@ -47,7 +47,7 @@ from cvo_edge.pose import Chart
 CONFIDENCE = 0.9
 
 # Of the tests those that an emulated processor is too slow for.
-MARKS = "whole_clip or clock"
+MARKS = "whole_clip"
 
 # In the joint scope sets differ from the others in their thresholds alone: the first fifth of the
 # frames will do, as an emulated inference takes a second.

@@ -22,6 +22,7 @@ from cvo_edge.engine.observer import Observation, Observer
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import ModelError, UsageError
 from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.input.clock import SYSTEM_CLOCK
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.frame_checks import StreamChecks
 from cvo_edge.pose import Pose
@@ -36,7 +37,7 @@ class Seen(NamedTuple):
     """One frame before its stream is known: what a worker returns and ``conclude`` takes.
 
     ``conformal_set`` is unbounded where the observation has a fault or a doubt. ``conformal_ms`` is
-    what the set took, ``total_ms`` all from the image on.
+    the time spent on the set, ``total_ms`` the time from reading the frame to having the set.
     """
 
     frame: Frame
@@ -108,6 +109,7 @@ class Odometer:
         )
         self.chart = self._observer.chart
         self._stream_checks = StreamChecks()
+        self._clock = SYSTEM_CLOCK
         self._stepping = Lock()
         self._seq = 0
 
@@ -245,7 +247,7 @@ class Odometer:
             )
         self._stream_checks = StreamChecks()
         with closing(
-            run_stream(frames, self.mode, self._workers, self._see, lambda: self._seq)
+            run_stream(frames, self.mode, self._workers, self._see, lambda: self._seq, self._clock)
         ) as stream:
             for seen in stream:
                 yield self.conclude(seen)
@@ -264,13 +266,15 @@ class Odometer:
 
     def _see(self, frame: Frame, seq: int) -> Seen:
         """Everything that does not depend on the frames before; safe in several threads."""
+        waited_ms = max(frame.read_ms, frame.since_arrival_ms(self._clock.now_s()))
         start = perf_counter()
         observation = self._observer.observe(frame.image, seq)
         observed = perf_counter()
         usable = observation.fault is None and observation.doubt is None
         found = self.conformal_set(observation) if usable else unbounded_set()
         end = perf_counter()
-        return Seen(frame, seq, observation, found, 1e3 * (end - observed), 1e3 * (end - start))
+        conformal_ms, total_ms = 1e3 * (end - observed), waited_ms + 1e3 * (end - start)
+        return Seen(frame, seq, observation, found, conformal_ms, total_ms)
 
     def conclude(self, seen: Seen) -> PoseInterval:
         """Add what the frames before speak against a frame; frames come once, in their order.
@@ -281,7 +285,9 @@ class Odometer:
         self._seq = seen.seq + 1
         fault, found = observation.fault, seen.conformal_set
         doubts = tuple(reason for reason in (observation.doubt, fault) if reason is not None)
-        doubts += self._stream_checks.doubts(observation.look, frame.stamp_ns, frame.waited_ms)
+        # The age counts until the estimate is given: a process may be stopped at any point.
+        age_ms = frame.age_ms(self._clock.now_s())
+        doubts += self._stream_checks.doubts(observation.look, frame.stamp_ns, age_ms)
         if doubts:
             found = unbounded_set()
         return PoseInterval(
@@ -300,7 +306,7 @@ class Odometer:
                 "preprocess": round(observation.preprocess_ms, 4),
                 "model": round(observation.model_ms, 4),
                 "conformal": round(seen.conformal_ms, 4),
-                "total": round(frame.read_ms + frame.waited_ms + seen.total_ms, 4),
+                "total": round(seen.total_ms, 4),
             },
         )
 

@@ -20,8 +20,6 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
-from threading import Condition, Event, Thread
-from time import perf_counter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -29,9 +27,9 @@ from numpy.typing import NDArray
 
 from cvo_edge.engine.cores import checked_threads
 from cvo_edge.errors import UsageError
-from cvo_edge.input.capture import READER
+from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
 from cvo_edge.input.frame import Frame, Source
-from cvo_edge.input.queue_lag import clock_s
+from cvo_edge.input.newest import Newest, Played
 from cvo_edge.vocabulary import MODES, Mode
 
 Result = TypeVar("Result")
@@ -40,8 +38,6 @@ Work = Callable[[Frame, int], Result]
 
 # Frames queued behind those in work, so that one slow frame does not leave cores idle.
 AHEAD = 2
-# How long a stream that ends waits for a frame that is on its way.
-_PATIENCE_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +74,7 @@ def run_stream(
     workers: int,
     work: Work[Result],
     next_seq: Callable[[], int],
+    clock: Clock = SYSTEM_CLOCK,
 ) -> Generator[Result, None, None]:
     """Yield what ``work`` makes of each frame, in the order of the frames.
 
@@ -91,13 +88,15 @@ def run_stream(
         Called with each frame and its number.
     next_seq
         Number of the next frame that nobody has been given yet.
+    clock
+        Paces a recording in ``live``, and dates the arrival of frames.
 
     Raises what the source and ``work`` raise, in its place after the results before it, and in
     ``live`` UsageError for a recording without stamps.
     """
     # The frames of a camera have to be taken as they come: those that nobody takes grow old.
     if mode == "live" or (isinstance(frames, Source) and frames.live):
-        with closing(_newest(frames)) as newest:
+        with closing(_newest(frames, clock)) as newest:
             yield from _one_by_one(newest, work, next_seq)
     elif mode == "throughput":
         reads = frames.reads() if isinstance(frames, Source) else map(_already_read, frames)
@@ -108,12 +107,12 @@ def run_stream(
         yield from _one_by_one(map(_as_frame, frames), work, next_seq)
 
 
-def _newest(frames: Iterable[Frame | NDArray[Any]]) -> Generator[Frame, None, None]:
+def _newest(frames: Iterable[Frame | NDArray[Any]], clock: Clock) -> Generator[Frame, None, None]:
     if isinstance(frames, Source):
-        coming = frames if frames.live else Played(frames)
+        coming = frames if frames.live else Played(frames, clock)
         # A source that somebody else wrote need not have it.
-        return iter(Newest(coming, getattr(coming, "stop", None)))
-    return iter(Newest(map(_kept, frames)))
+        return iter(Newest(coming, getattr(coming, "stop", None), clock))
+    return iter(Newest(map(_kept, frames), clock=clock))
 
 
 def _one_by_one(
@@ -174,91 +173,3 @@ def _failing_last(tasks: Iterable[Callable[[], Result]]) -> Iterator[Callable[[]
             raise failure
 
         yield fail
-
-
-class Newest:
-    """The newest frame of a source, which does not wait for whoever looks at it.
-
-    A thread reads on; frames that were not looked at before the next one came are left out, and
-    counted in ``Frame.skipped``. ``stop`` ends the source's wait for its next frame.
-    """
-
-    def __init__(self, frames: Iterable[Frame], stop: Callable[[], None] | None = None) -> None:
-        self._frames, self._stop = frames, stop
-        self._changed = Condition()
-        self._frame: Frame | None = None
-        self._ready_at = 0.0
-        self._skipped = 0
-        self._closed = False
-        self._ended = False
-        self._failure: BaseException | None = None
-
-    def __iter__(self) -> Generator[Frame, None, None]:
-        """Yield frames until the source ends; raises what it raised, after its last frame."""
-        # A camera may never give another frame: nothing waits for ever for who waits for it.
-        reader = Thread(target=self._read, name=READER, daemon=True)
-        reader.start()
-        try:
-            while True:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._frame or self._ended)
-                    frame, skipped, self._skipped = self._frame, self._skipped, 0
-                    self._frame, ready_at = None, self._ready_at
-                if frame is None:
-                    break
-                waited_ms = 1e3 * (clock_s() - ready_at)
-                yield replace(frame, waited_ms=frame.waited_ms + waited_ms, skipped=skipped)
-        finally:
-            self._closed = True
-            if self._stop is not None:
-                self._stop()
-            # A thread that Python ends inside OpenCV takes the process with it.
-            reader.join(_PATIENCE_S)
-        if self._failure is not None:
-            raise self._failure
-
-    def _read(self) -> None:
-        try:
-            for frame in self._frames:
-                with self._changed:
-                    self._skipped += self._frame is not None
-                    self._frame, self._ready_at = frame, clock_s()
-                    self._changed.notify()
-                if self._closed:
-                    return
-        except BaseException as error:  # noqa: BLE001 - raised by whoever iterates
-            self._failure = error
-        finally:
-            with self._changed:
-                self._ended = True
-                self._changed.notify()
-
-
-class Played:
-    """A recording at the times of its stamps, as a camera would give it; late frames at once.
-
-    Raises UsageError for a frame without a stamp.
-    """
-
-    def __init__(self, source: Iterable[Frame]) -> None:
-        self._source = source
-        self._stopped = Event()
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames, each at its time, until ``stop``."""
-        begin = None
-        for frame in self._source:
-            if frame.stamp_ns is None:
-                raise UsageError(
-                    "live: expected a camera, or frames with stamps (--fps), found none"
-                )
-            if begin is None:
-                begin = perf_counter() - 1e-9 * frame.stamp_ns
-            pause_s = begin + 1e-9 * frame.stamp_ns - perf_counter()
-            if self._stopped.wait(max(0.0, pause_s)):
-                return
-            yield frame
-
-    def stop(self) -> None:
-        """End the play, whoever is waiting for its next frame."""
-        self._stopped.set()

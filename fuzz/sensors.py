@@ -157,7 +157,7 @@ def _estimates(
                 now_ns += _STAMPS[kind] - _STEP_NS
                 frame = replace(frame, stamp_ns=now_ns)
             elif kind == "stale":
-                frame = replace(frame, waited_ms=float(generator.uniform(1001.0, 1e5)))
+                frame = replace(frame, queued_ms=float(generator.uniform(1001.0, 1e5)))
             left -= kind is not None
             kinds.append(kind)
             if frame.image is not None and to_bgr8(frame.image) is not None:

@@ -1,7 +1,7 @@
-"""OpenCV's video capture in a thread of its own, which can be left behind.
+"""OpenCV's video capture, run in a thread of its own that can be abandoned.
 
-A read of a stalled stream does not come back, and no signal is answered while it lasts. So the
-caller waits for an answer instead, for a bounded time; the thread that never answers is a daemon.
+A read of a stalled stream never returns, and Python handles no signal during it. The caller
+therefore waits for the thread's answer, for a bounded time. The thread is a daemon.
 """
 
 from __future__ import annotations
@@ -10,112 +10,136 @@ import contextlib
 import math
 import os
 import re
-import time
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from threading import Event, Thread, current_thread
-from time import perf_counter
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.input.queue_lag import Arrivals, clock_s
+from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
+from cvo_edge.input.queue_lag import DriverStamps, LagAccount
 
-# What the command line looks for when it ends: Python must not end such a thread inside OpenCV.
+# The command line looks for this name when it exits: if Python ends a thread inside OpenCV, the
+# process aborts.
 READER = "cvo-edge reader"
 
 TIMEOUT_S = 5.0
-# To open takes longer than the next frame: an address is looked up, a format is probed.
+# Opening takes longer than the next frame: an address is resolved, a format is probed.
 _OPENING = 2.0
 _PARTS = 20
-# Giving a device back takes milliseconds.
+# Releasing a device takes milliseconds.
 _RELEASE_S = 1.0
 
 T = TypeVar("T")
 
 
 def shown(device: int | str) -> str:
-    """Return a device's name for records and messages: in UTF-8, and without a password."""
-    # A file name may be any bytes.
+    """Return a device's name for records and messages: valid UTF-8, without a password."""
+    # A file name may hold any bytes.
     text = os.fsencode(str(device)).decode("utf-8", "replace")
     return re.sub("(?<=://)[^/]*@", "", text)
 
 
 @dataclass(frozen=True, eq=False)
 class Grabbed:
-    """One image, mostly (height, width, 3) uint8 BGR, and the clock's time when it had come.
+    """One image and its times.
 
-    ``decode_ms`` is what it took from then on; ``read_ms`` with the wait for it, which is nothing
-    but reading where frames are there already; ``queued_ms`` how long it may have lain in a queue
-    of a camera before. ``position_ms`` is where a file's container puts it; a build of OpenCV may
-    count from the first frame's end.
+    ``image`` is mostly (height, width, 3) uint8 BGR. ``stamp_ns`` is the time of day at which the
+    frame arrived, ``arrived_s`` the same moment on ``Clock.now_s``. ``decode_ms`` is the time spent
+    from then on; ``read_ms`` also includes the wait for the frame. ``queued_ms`` bounds the age of
+    the frame at its arrival: the time it may have spent in a camera's queue. ``position_ms`` is the
+    frame's time in a file's container; some builds of OpenCV count from the end of the first frame.
     """
 
     image: NDArray[Any]
     stamp_ns: int
+    arrived_s: float
     position_ms: float
     decode_ms: float
     read_ms: float
     queued_ms: float
 
 
-class Capture:
-    """A video file, camera or stream, for OpenCV to open, by one thread.
+class Reader(Protocol):
+    """What a source reads from: a ``Capture``, or a test's camera."""
 
-    A call that takes longer than ``timeout_s``, to open twice that, raises SourceError, and the
-    device is given up.
+    def open(self) -> tuple[float, int]:
+        """Open the device; see ``Capture.open``."""
+
+    def read(self) -> Grabbed | None:
+        """Return the next image; see ``Capture.read``."""
+
+    def close(self) -> None:
+        """Release the device; see ``Capture.close``."""
+
+
+class Capture:
+    """A video file, camera or stream that OpenCV reads, in one thread.
+
+    A call that takes longer than ``timeout_s`` raises SourceError, and the device is abandoned;
+    opening may take twice as long.
     """
 
-    def __init__(self, device: int | str, timeout_s: float) -> None:
+    def __init__(self, device: int | str, timeout_s: float, clock: Clock = SYSTEM_CLOCK) -> None:
         self._device, self._timeout_s = device, timeout_s
         self._calls: SimpleQueue[Callable[[_Opened], object] | None] = SimpleQueue()
         self._answers: SimpleQueue[object] = SimpleQueue()
         self._idle = Event()
         self._closed = False
-        # The thread does not hold this object: whoever drops it ends the thread as well.
-        thread = Thread(
-            target=_work, args=(self._calls, self._answers, self._idle), name=READER, daemon=True
-        )
+        # The thread holds no reference to this object, so that dropping it ends the thread.
+        arguments = (self._calls, self._answers, self._idle, clock)
+        thread = Thread(target=_work, args=arguments, name=READER, daemon=True)
         try:
             thread.start()
         except RuntimeError as error:
-            raise SourceError(f"{shown(device)}: expected a thread to read it: {error}") from None
-        # Also where Python ends: it would end such a thread within OpenCV, and the process with it.
+            raise SourceError(
+                f"{shown(device)}: cannot start its reading thread: {error}"
+            ) from None
+        # Also when Python exits, before it ends threads inside OpenCV and aborts.
         self._end = weakref.finalize(self, _end, thread, self._calls, self._idle)
 
     def open(self) -> tuple[float, int]:
-        """Open the device -> frames a second and their number, 0 where it does not say.
+        """Open the device; return its frame rate and number of frames, 0 if it does not state them.
 
-        Raises SourceError where that cannot be done.
+        Raises
+        ------
+        SourceError
+            The device does not open.
         """
         device = self._device
         try:
-            # OpenCV ends the process at what is not.
+            # OpenCV aborts the process on other names.
             str(device).encode()
         except UnicodeEncodeError:
             raise SourceError(
-                f"{shown(device)}: expected a name in UTF-8, found another: OpenCV opens none such"
+                f"{shown(device)}: the name is not valid UTF-8, which OpenCV needs; rename it"
             ) from None
         found = self._ask(lambda opened: opened.open(device), _OPENING * self._timeout_s)
         if found is None:
             self.close()
-            raise SourceError(f"{shown(device)}: expected a video or camera that opens, found none")
+            raise SourceError(f"{shown(device)}: did not open as a video or camera")
         return found
 
     def read(self) -> Grabbed | None:
-        """Return the next image, or None at the end, and for a file's frame that does not decode.
+        """Return the next image, or None at the end and for a frame that does not decode.
 
-        Whether it was the end is seen by asking again.
+        The two cases differ in what the next call returns.
+
+        Raises
+        ------
+        SourceError
+            The device did not answer in time, or is closed.
         """
         return self._ask(_Opened.grab, self._timeout_s)
 
     def close(self) -> None:
-        """Give it back, as soon as what it is at comes to an end; whoever waits need not."""
+        """Release the device once the pending call returns; callers do not block."""
         self._closed = True
         self._answers.put(SourceError(f"{shown(self._device)}: closed"))
         self._end()
@@ -125,31 +149,30 @@ class Capture:
             raise SourceError(f"{shown(self._device)}: closed")
         self._idle.clear()
         self._calls.put(call)
-        # In parts: while this process is stopped one of them runs out, and not the thread's time.
+        # In parts: if this process is stopped, one part expires, and not the whole time.
         for _ in range(_PARTS):
             with contextlib.suppress(Empty):
                 answer = self._answers.get(timeout=timeout_s / _PARTS)
                 break
         else:
             self.close()
-            raise SourceError(
-                f"{shown(self._device)}: expected an answer within {timeout_s:g} s, found none"
-            )
+            raise SourceError(f"{shown(self._device)}: gave no answer within {timeout_s:g} s")
         if isinstance(answer, Exception):
             raise answer
-        return answer  # type: ignore[return-value]  # of this very call
+        return answer  # type: ignore[return-value]  # the answer to this call
 
 
 def _work(
     calls: SimpleQueue[Callable[[_Opened], object] | None],
     answers: SimpleQueue[object],
     idle: Event,
+    clock: Clock,
 ) -> None:
-    opened = _Opened()
+    opened = _Opened(cv2.VideoCapture(), clock)
     while (call := calls.get()) is not None:
         try:
             answer = call(opened)
-        except Exception as error:  # noqa: BLE001 - raised by whoever asked
+        except Exception as error:  # noqa: BLE001 - raised by the caller
             answer = error
         idle.set()
         answers.put(answer)
@@ -160,36 +183,43 @@ def _end(
     thread: Thread, calls: SimpleQueue[Callable[[_Opened], object] | None], idle: Event
 ) -> None:
     calls.put(None)
-    # Nobody waits for one that hangs; memory may be tidied up in the thread itself.
+    # A thread that hangs is not waited for; the finalizer may also run in the thread itself.
     if idle.is_set() and thread is not current_thread():
         thread.join(_RELEASE_S)
 
 
 class _Opened:
-    """What the thread alone touches: the capture, and when its frames came."""
+    """The capture and the ages of its frames; only the reading thread uses it."""
 
-    def __init__(self) -> None:
-        self._capture = cv2.VideoCapture()
-        self._arrivals = Arrivals(clock_s(), 0.0)
+    def __init__(self, capture: cv2.VideoCapture, clock: Clock) -> None:
+        self._capture, self._clock = capture, clock
+        self._account = LagAccount(clock.now_s(), 0.0)
+        self._driver: DriverStamps | None = None
 
     def open(self, device: int | str) -> tuple[float, int] | None:
-        """Open it -> frames a second and their number, as the container says; None if it is not."""
-        begin = clock_s()
+        """Open the device; return its frame rate and number of frames, None if it does not open."""
+        begin = self._clock.now_s()
         try:
             if not self._capture.open(device):
                 return None
             fps, count = map(self._capture.get, (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
+            backend = self._capture.getBackendName()
         except cv2.error:
             return None
-        self._arrivals = Arrivals(begin, fps)
+        self._account = LagAccount(begin, fps)
+        # Video4Linux reports the driver's stamp as the position; other backends count from a start.
+        self._driver = DriverStamps() if backend == "V4L2" else None
         return fps, int(count) if 0.0 < count < math.inf else 0
 
     def grab(self) -> Grabbed | None:
-        """Take the next image, None where none comes."""
+        """Return the next image, None if there is none."""
+        clock = self._clock
+        # In this order, a thread that is not run in between appears to have slept less, not more.
+        busy_s, begin = clock.busy_s(), clock.now_s()
         try:
-            begin = perf_counter()
             found = self._capture.grab()
-            stamp_ns, come = time.time_ns(), perf_counter()
+            stamp_ns, awake_s, arrived = clock.time_ns(), clock.awake_s(), clock.now_s()
+            busy_s = clock.busy_s() - busy_s
             if found:
                 found, image = self._capture.retrieve()
             position_ms = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
@@ -197,16 +227,21 @@ class _Opened:
             return None
         if not found:
             return None
-        end = perf_counter()
+        queued_s = self._account.queued_s(arrived, arrived - begin - busy_s)
+        if self._driver is not None:
+            age_s = self._driver.age_s(1e-3 * position_ms, awake_s, arrived)
+            queued_s = queued_s if age_s is None else age_s
+        end = clock.now_s()
         return Grabbed(
             image=np.asarray(image),
             stamp_ns=stamp_ns,
+            arrived_s=arrived,
             position_ms=position_ms,
-            decode_ms=1e3 * (end - come),
+            decode_ms=1e3 * (end - arrived),
             read_ms=1e3 * (end - begin),
-            queued_ms=1e3 * self._arrivals.queued_s(clock_s()),
+            queued_ms=1e3 * queued_s,
         )
 
     def release(self) -> None:
-        """Give it back."""
+        """Release the device."""
         self._capture.release()

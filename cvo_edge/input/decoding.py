@@ -1,7 +1,7 @@
-"""Bytes of an image file -> pixels, where they are whole, of bearable size, and of known meaning.
+"""Bytes of an image file -> pixels, if the file is whole, of a bounded size and unambiguous.
 
-A decoder believes its header: 100 kB of PNG may ask for gigabytes. So the size is read first, by
-ourselves, as OpenCV can only be told a limit by the environment, before it is imported.
+Decoders trust the header: 100 kB of PNG may ask for gigabytes. The size is therefore read here
+first; OpenCV takes a limit only from the environment, before it is imported.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# As BGR 192 MiB, and a few times that while some formats are decoded; an 8K camera has half of it.
+# 192 MiB as BGR, and several times that while some formats are decoded; 8K cameras have half of it.
 MAX_PIXELS = 1 << 26
-# Of 16-bit colours without compression, with room for what else a file holds.
+# Uncompressed 16-bit colours, with room for the rest of a file.
 MAX_IMAGE_BYTES = 1 << 29
 
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 _JPEG_END, _JPEG_SCAN = b"\xff\xd9", b"\xff\xda"
-# Segments and chunks before the picture; cameras write ten of them, 64 KiB each at most in a JPEG.
+# Segments and chunks before the picture; cameras write about ten, of at most 64 KiB in a JPEG.
 _MOST_PARTS = 4096
-# Each pass over a picture takes as long as one picture; cameras write one, tools ten.
+# Each scan takes as long to decode as a picture; cameras write one, tools about ten.
 _MOST_SCANS = 64
-# Frames that have one scan where that is of all their components: not progressive (T.81, B.1.1.3).
+# Frame types that are not progressive: one scan of all components is the whole picture (T.81, B.1).
 _SEQUENTIAL = frozenset((0xC0, 0xC1, 0xC9))
-# Markers without a length belong into data; what hides behind one is not what a decoder sees.
+# Markers without a length belong in the data; decoders disagree on what follows one elsewhere.
 _BARE = frozenset((0x01, *range(0xD0, 0xDA)))
-# Decoders differ in whether a comment ends with a carriage return: one that has it is refused.
+# Decoders differ in whether a carriage return ends a comment, so a comment with one is refused.
 _GAP = rb"\s+(?:#[^\r\n]*\n\s*)*"
 _PNM = re.compile(rb"P[1-6]" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})\s")
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_TILE = 256, 257, (322, 323)
@@ -40,14 +40,14 @@ _TIFF_NUMBERS = {3: "H", 4: "I"}
 
 
 def decode_image(content: bytes) -> NDArray[np.uint8] | None:
-    """Bytes of an image file -> (height, width, 3) uint8 BGR, or None where that cannot be had.
+    """Decode an image file to (height, width, 3) uint8 BGR; None if it is damaged or unsupported.
 
-    JPEG, PNG, BMP, PNM, TIFF and WebP, known by their first bytes. Grey is repeated, alpha dropped,
-    16 bits keep their upper eight, and the camera's own pixel order is kept (no EXIF rotation).
-    None where the header is none of these, says two things or asks for more than ``MAX_PIXELS``,
-    and where the file is not whole: some OpenCV versions decode a cut JPEG to a full-size wrong
-    picture, so its end marker is looked for first. What is altered within a JPEG's data mostly
-    passes: unlike PNG, it has no checksum.
+    JPEG, PNG, BMP, PNM, TIFF and WebP are recognised by their first bytes. Grey is repeated, alpha
+    dropped, 16 bits keep their upper eight, and the sensor's pixel order is kept (no EXIF
+    rotation). The result is None for other formats, for a header that contradicts itself or asks
+    for more than ``MAX_PIXELS``, and for an incomplete file: some OpenCV versions decode a cut JPEG
+    to a wrong picture of full size, so its end marker is checked first. Altered bytes within a
+    JPEG's data mostly pass because, unlike PNG, it has no checksum.
     """
     size = image_size(content)
     if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
@@ -67,14 +67,14 @@ def is_image(start: bytes) -> bool:
     """Whether a file's first 16 bytes are those of an image that ``decode_image`` knows."""
     if start.startswith(b"P"):
         return re.match(rb"P[1-6]\s", start) is not None
-    # RIFF is a family: videos are of it, too.
+    # RIFF also holds videos.
     if start.startswith(b"RIFF"):
         return start[8:12] == b"WEBP"
     return any(start.startswith(begin) for begin, _ in _FORMATS)
 
 
 def image_size(content: bytes) -> tuple[int, int] | None:
-    """Height and width in the header of an image file, or None where it has none that is whole."""
+    """Return height and width from the header of an image file, None if there is no whole one."""
     for start, read in _FORMATS:
         if content.startswith(start):
             try:
@@ -85,7 +85,7 @@ def image_size(content: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg(content: bytes) -> tuple[int, int] | None:
-    """Of the frame header; None where the end of the image is not behind the start of its data."""
+    """Read the frame header; None if the end of the image does not follow the start of its data."""
     size, components, position = None, 0, 2
     for _ in range(_MOST_PARTS):
         if content[position] != 0xFF:
@@ -106,7 +106,7 @@ def _jpeg(content: bytes) -> tuple[int, int] | None:
                 components = 0
         if marker == 0xDA:
             alone = 0 < components == content[position + 4]
-            # Within data 0xff is never followed by either.
+            # Neither marker can occur within the data.
             whole = content.rfind(_JPEG_END) >= position + 2 + length
             few = alone or content.count(_JPEG_SCAN) <= _MOST_SCANS
             return size if whole and few else None
@@ -121,7 +121,7 @@ def _png(content: bytes) -> tuple[int, int] | None:
 
 def _bmp(content: bytes) -> tuple[int, int]:
     (header,) = struct.unpack_from("<I", content, 14)
-    # OS/2's first header has 16 bits; in others rows may be stored from the top: a negative height.
+    # OS/2's first header has 16-bit sizes; in others a negative height means rows from the top.
     width, height = struct.unpack_from("<HH" if header == 12 else "<ii", content, 18)
     return abs(height), abs(width)
 
@@ -132,9 +132,9 @@ def _pnm(content: bytes) -> tuple[int, int] | None:
 
 
 def _tiff(content: bytes) -> tuple[int, int] | None:
-    """Of the first picture; tags are numbered, each with its type, count and value.
+    """Read the size of the first picture; each tag has a number, type, count and value.
 
-    None where a tag is there twice, or tiles are larger than may be decoded.
+    None if a tag occurs twice, or if tiles are larger than ``MAX_PIXELS``.
     """
     order = "<" if content.startswith(b"II") else ">"
     (begin,) = struct.unpack_from(order + "I", content, 4)
@@ -152,7 +152,7 @@ def _tiff(content: bytes) -> tuple[int, int] | None:
 
 
 def _webp(content: bytes) -> tuple[int, int] | None:
-    """Of the picture itself, behind what an extended file has before it; None for an animation."""
+    """Read the size of the picture behind the chunks of an extended file; None for an animation."""
     if content[8:12] != b"WEBP":
         return None
     canvas, position = None, 12

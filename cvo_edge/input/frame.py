@@ -13,34 +13,44 @@ from numpy.typing import NDArray
 class Frame:
     """One image of a source, or its absence.
 
-    ``image`` is (height, width, 3) uint8 BGR, or None where it could not be read whole; who makes
-    frames of their own may put in whatever ``Odometer.step`` takes;
-    ``stamp_ns`` is None where the source has no clock; ``read_ms`` what reading and decoding took,
-    without waiting for a camera; ``waited_ms`` how long it lay ready since, or may have lain in a
-    camera's queue before; ``skipped`` how many
-    frames of the source before it were left out.
+    ``image`` is (height, width, 3) uint8 BGR, or None if it could not be read whole; callers that
+    build frames may use any image that ``Odometer.step`` accepts. ``stamp_ns`` is None if the
+    source has no clock. ``read_ms`` is the time spent reading and decoding, without the wait for a
+    camera. ``queued_ms`` bounds the age of the frame when it arrived: the time it may have spent in
+    a camera's queue. ``arrived_s`` is the time of arrival on ``Clock.now_s``, None if the frame
+    does not age (files, frames of a caller). ``skipped`` is the number of frames of the source that
+    were dropped before this one.
     """
 
     image: NDArray[Any] | None
     stamp_ns: int | None
     source: str
     read_ms: float
-    waited_ms: float = 0.0
+    queued_ms: float = 0.0
+    arrived_s: float | None = None
     skipped: int = 0
+
+    def age_ms(self, now_s: float) -> float:
+        """Return an upper bound on the frame's age at ``now_s`` of ``Clock.now_s``."""
+        return self.queued_ms + self.since_arrival_ms(now_s)
+
+    def since_arrival_ms(self, now_s: float) -> float:
+        """Return the time from the frame's arrival until ``now_s``, 0 if it does not age."""
+        return 0.0 if self.arrived_s is None else 1e3 * (now_s - self.arrived_s)
 
 
 @runtime_checkable
 class Source(Protocol):
-    """Something that yields frames once, in order; ``length`` is None where it has no end.
+    """Something that yields frames once, in order; ``length`` is None if it has no end.
 
-    ``live`` says whether frames come by themselves, as those of a camera do.
+    ``live`` says whether frames come at their own pace, as those of a camera do.
     """
 
     length: int | None
     live: bool
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
-        """Yield a call for each frame that reads and decodes it; calls may be in other threads."""
+        """Yield a call for each frame that reads and decodes it; calls may run in other threads."""
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames."""

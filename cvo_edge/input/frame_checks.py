@@ -28,7 +28,7 @@ _BLACK, _SATURATED, _FLAT = 20, 250, 4.0
 _FEW = 0.02
 # Drivers hand out a few buffers in turn, and a dead one may hand out the same few for ever.
 _BUFFERS = 8
-# A frame that lay so long was there before something stopped this process or its source.
+# An older frame says where the camera was, not where it is.
 _STALE_MS = 1000.0
 
 
@@ -66,9 +66,7 @@ class StreamChecks:
         self._size: tuple[int, int] | None = None
         self._stamp_ns: int | None = None
 
-    def doubts(
-        self, look: Look | None, stamp_ns: int | None, waited_ms: float
-    ) -> tuple[Reason, ...]:
+    def doubts(self, look: Look | None, stamp_ns: int | None, age_ms: float) -> tuple[Reason, ...]:
         """Compare a frame with those before it, and remember it; no look where it is no image.
 
         A sensor's noise never repeats: the same image again is the old one, an encoder's copy of
@@ -88,7 +86,7 @@ class StreamChecks:
             if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
                 doubts += (Reason.STAMP_NOT_LATER,)
             self._stamp_ns = stamp_ns
-        if waited_ms > _STALE_MS:
+        if age_ms > _STALE_MS:
             doubts += (Reason.FRAME_STALE,)
         return doubts
 

@@ -1,4 +1,4 @@
-"""Where frames come from: a folder or glob of images, a video file, a camera."""
+"""Sources of frames: a folder or glob of images, a video file, a camera."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import logging
 import math
 import os
 import re
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -20,19 +19,20 @@ from typing import SupportsIndex, TypeVar
 
 from cvo_edge.errors import SourceError, UsageError, printable
 from cvo_edge.files import read_regular_file
-from cvo_edge.input.capture import TIMEOUT_S, Capture, shown
+from cvo_edge.input.capture import TIMEOUT_S, Capture, Reader, shown
+from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
 from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image, is_image
 from cvo_edge.input.frame import Frame, Source
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
-# Videos that begin as an image does.
+# Videos whose first bytes are those of an image.
 _JPEGS_IN_A_ROW = (".mjpg", ".mjpeg")
 
-# Stamps are nanoseconds in 64 bits, also after years.
+# Stamps are nanoseconds in 64 bits, which must last for years.
 LOWEST_FPS, HIGHEST_FPS = 1e-3, 1e6
 LONGEST_S = 3600.0
 
-# Before each new attempt to open a camera: eight seconds in all.
+# Pauses before each new attempt to open a camera: eight seconds in total.
 PAUSES_S = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 _LOG = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ def open_source(
     Raises
     ------
     SourceError
-        There is no such source, or no image in it.
+        There is no such source, or it holds no image.
     UsageError
         ``source`` is of another type, or ``fps`` or ``timeout_s`` is out of range.
     """
@@ -72,11 +72,11 @@ def open_source(
     try:
         path.exists()
     except OSError as error:
-        raise SourceError(f"{shown(text)}: cannot be looked for: {error.strerror}") from None
+        raise SourceError(f"{shown(text)}: not a usable name: {error.strerror}") from None
     if path.is_dir():
         return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
     if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
-        raise SourceError(f"{shown(text)}: expected a file's path, found an address of one")
+        raise SourceError(f"{shown(text)}: expected a file's path, found a file address")
     if names_camera(text):
         return Camera(int(text) if text.isdecimal() else text, fps, timeout_s)
     if path.is_file():
@@ -89,8 +89,8 @@ def open_source(
             _colour_images(found), fps, f"{shown(text)}: expected images, found no match"
         )
     raise SourceError(
-        f"{shown(text)}: expected a folder, glob, video file, camera index or device, found none "
-        "of these"
+        f"{shown(text)}: not found; expected a folder, glob, video file, camera index, device or "
+        "address"
     )
 
 
@@ -105,7 +105,7 @@ def _text(source: str | os.PathLike[str] | int) -> str:
 
 
 def names_camera(text: str) -> bool:
-    """Whether frames come by themselves there: an index, a device, a named pipe or an address."""
+    """Whether ``text`` names a live source: an index, a device, a named pipe or an address."""
     path = Path(text)
     if path.is_dir():
         return False
@@ -113,7 +113,7 @@ def names_camera(text: str) -> bool:
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key that reads digits as numbers: ``frame-2`` before ``frame-10``."""
+    """Sort key that compares digits as numbers: ``frame-2`` before ``frame-10``."""
     parts = re.split("([0-9]+)", str(path))
     return [
         (1, 0, part) if index % 2 == 0 else (0, int(part), "")
@@ -123,7 +123,7 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
 
 
 class ImageFiles:
-    """Image files in the given order; an unreadable one costs that frame only."""
+    """Image files in the given order; an unreadable file is a frame without an image."""
 
     live = False
 
@@ -148,12 +148,12 @@ class ImageFiles:
 class Video:
     """A video file. Stamps are its container's, from the first frame on, unless ``fps`` is given.
 
-    Of a frame that does not decode, and has others behind it, there is no image.
+    A frame that does not decode has no image if a later one decodes; else the video ends there.
     """
 
     live = False
 
-    # So many in a row are an end, also where no number of frames is announced.
+    # So many in a row are the end, also if the container announces no number of frames.
     _UNREADABLE_IN_A_ROW = 100
 
     def __init__(self, path: Path, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
@@ -164,12 +164,12 @@ class Video:
         self.length: int | None = announced if announced > 0 else None
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
-        """Yield the frames, read: one comes after the other."""
+        """Yield the frames; each is read before its call is yielded."""
         for frame in self:
             yield partial(_itself, frame)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames; raises SourceError where the file ends before its own count."""
+        """Yield the frames; raises SourceError if the file ends before its own count."""
         seq = unreadable = 0
         with closing(self._capture):
             while unreadable < self._UNREADABLE_IN_A_ROW:
@@ -184,19 +184,19 @@ class Video:
                 unreadable = 0
         if self.length is not None and seq < self.length:
             raise SourceError(
-                f"{self._path}: expected {self.length} frames, as its header says or its duration "
-                f"gives, found it ended early: {seq} of {self.length}"
+                f"{self._path}: ended early: {seq} of {self.length} frames (by its header or "
+                "duration); copy or record it again"
             )
 
 
 class _VideoStamps:
-    """Where a container puts its frames, in ns from the first one, unless a rate is given.
+    """Times of a container's frames in ns, from the first one, unless a rate is given.
 
-    A frame that a decoder leaves out does not shift the ones behind it, and a phone's frames are
-    not one as long as the other. A container without times has those of its own rate.
+    A frame that a decoder skips does not shift later ones, and a phone's frame rate varies. For a
+    container without times, they follow from its rate.
     """
 
-    # Nanoseconds in a record are of 64 bits.
+    # A record's nanoseconds have 64 bits.
     _END_NS = 2.0**62
 
     def __init__(self, fps: float | None, own_fps: float) -> None:
@@ -207,9 +207,9 @@ class _VideoStamps:
         self._origin_ms, self._last_ns = math.nan, 0.0
 
     def next(self, count: int, position_ms: float) -> list[int | None]:
-        """Stamps of the next ``count`` frames, the last of which is at ``position_ms``.
+        """Return the stamps of the next ``count`` frames, the last of which is at ``position_ms``.
 
-        Those before it, unreadable ones, are put evenly between.
+        The unreadable frames before it are spaced evenly.
         """
         begin, self._seq = self._seq, self._seq + count
         if self._fps is not None:
@@ -224,47 +224,58 @@ class _VideoStamps:
         if last_ns < now_ns < self._END_NS:
             self._has_times = begin > 0
         else:
-            # Half a frame where others have times, so that the next one's is a later one again.
+            # Half a frame if others have times, so that the next one's is later again.
             now_ns = last_ns + self._gap_ns * (0.5 if self._has_times else count)
         self._last_ns = now_ns
         return [round(last_ns + (now_ns - last_ns) * (k + 1) / count) for k in range(count)]
 
 
 class Camera:
-    """A camera by index, device path or address; stamps are the clock's when a frame arrived.
+    """A camera by index, device path or address; stamps are the times at which frames arrived.
 
-    One that does not open, or gives no frame for ``timeout_s``, is given up and opened again, a few
-    times, after ever longer pauses. A frame that does not decode has no image.
+    A camera that does not open, or gives no frame for ``timeout_s``, is closed and opened again,
+    a few times, after increasing pauses. A frame that does not decode has no image.
 
-    Its frames are to be taken as they come, as ``Odometer.stream`` does in every mode: what nobody
-    takes lies in queues of drivers.
+    Frames must be taken as they come, as ``Odometer.stream`` does in every mode: frames that nobody
+    takes age in the queues of drivers.
+
+    ``reader`` makes what frames are read from, and ``clock`` measures the time; tests replace both.
     """
 
     live = True
 
-    # So many in a row are an end.
+    # So many in a row are the end of the stream.
     _UNREADABLE_IN_A_ROW = 5
 
-    def __init__(self, device: int | str, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(
+        self,
+        device: int | str,
+        fps: float | None,
+        timeout_s: float = TIMEOUT_S,
+        *,
+        clock: Clock = SYSTEM_CLOCK,
+        reader: Callable[[int | str, float], Reader] = Capture,
+    ) -> None:
         self._device, self._fps, self._timeout_s = device, fps, timeout_s
-        self._capture: Capture | None = None
+        self._clock, self._reader = clock, reader
+        self._capture: Reader | None = None
         self._failures = self._since_opened = 0
         self._stopped = Event()
         self.length: int | None = None
         self._insisting(self._opened)
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
-        """Yield the frames, read: one comes after the other."""
+        """Yield the frames; each is read before its call is yielded."""
         for frame in self:
             yield partial(_itself, frame)
 
     def stop(self) -> None:
-        """End the frames, whoever is waiting for the next one."""
+        """End the frames, also while the next one is waited for."""
         self._stopped.set()
         self._close()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames until ``stop``; raises SourceError where none comes, opened anew or not."""
+        """Yield frames until ``stop``; raises SourceError if the camera does not come back."""
         seq = 0
         try:
             while not self._stopped.is_set():
@@ -273,7 +284,7 @@ class Camera:
                     return
                 self._since_opened += 1
                 if self._since_opened > 1:
-                    # One frame a connection is what an address of single pictures gives.
+                    # An address of single pictures gives one frame per connection.
                     self._failures = 0
                 for frame in frames:
                     stamp_ns = _stamp(seq, self._fps) if self._fps else frame.stamp_ns
@@ -282,11 +293,11 @@ class Camera:
         finally:
             self._close()
 
-    def _opened(self) -> Capture:
+    def _opened(self) -> Reader:
         capture = self._capture
         if capture is None:
-            # Known before it is waited for, so that ``stop`` finds it.
-            capture = self._capture = Capture(self._device, self._timeout_s)
+            # Stored before it is opened, so that ``stop`` can close it meanwhile.
+            capture = self._capture = self._reader(self._device, self._timeout_s)
             self._since_opened = 0
             if self._stopped.is_set():
                 self._close()
@@ -294,14 +305,24 @@ class Camera:
         return capture
 
     def _next(self) -> list[Frame] | None:
-        """The next frame that decodes, behind those that do not; None at the end."""
+        """Return the next frame that decodes, behind those that do not; None at the end."""
         frames: list[Frame] = []
-        capture, late = self._opened(), time.monotonic() + self._timeout_s
-        while len(frames) < self._UNREADABLE_IN_A_ROW and time.monotonic() < late:
+        clock, capture = self._clock, self._opened()
+        late = clock.awake_s() + self._timeout_s
+        while len(frames) < self._UNREADABLE_IN_A_ROW and clock.awake_s() < late:
             if (grabbed := capture.read()) is not None:
-                read_ms, queued_ms = grabbed.decode_ms, grabbed.queued_ms
-                return [*frames, Frame(grabbed.image, grabbed.stamp_ns, "", read_ms, queued_ms)]
-            frames.append(Frame(None, time.time_ns(), "", 0.0))
+                frames.append(
+                    Frame(
+                        grabbed.image,
+                        grabbed.stamp_ns,
+                        "",
+                        grabbed.decode_ms,
+                        grabbed.queued_ms,
+                        grabbed.arrived_s,
+                    )
+                )
+                return frames
+            frames.append(Frame(None, clock.time_ns(), "", 0.0))
         return None
 
     def _close(self) -> None:
@@ -310,7 +331,10 @@ class Camera:
             capture.close()
 
     def _insisting(self, call: Callable[[], T | None]) -> T | None:
-        """What a call gives at last; nothing and a SourceError are failures. None once stopped."""
+        """Return what a call gives at last, None once stopped.
+
+        None and a SourceError are failures of the call.
+        """
         while not self._stopped.is_set():
             try:
                 found = call()
@@ -319,15 +343,17 @@ class Camera:
             else:
                 if found is not None:
                     return found
-                problem = f"{shown(self._device)}: expected a frame, found its end"
+                problem = f"{shown(self._device)}: the stream ended"
             self._close()
             if self._stopped.is_set():
                 break
             if self._failures == len(PAUSES_S):
-                raise SourceError(f"{problem}, and again {self._failures} times")
+                raise SourceError(
+                    f"{problem} ({self._failures + 1} attempts); check the camera and its address"
+                )
             pause_s = PAUSES_S[self._failures]
             _LOG.warning("%s; opening it again in %g s", printable(problem), pause_s)
-            self._stopped.wait(pause_s)
+            self._clock.wait(self._stopped, pause_s)
             self._failures += 1
         return None
 
@@ -348,7 +374,7 @@ def _itself(frame: Frame) -> Frame:
 
 
 def _is_one_image(path: Path) -> bool:
-    """Whether a file without an image's ending is one: no video, of which FFmpeg would take it."""
+    """Whether a file without an image's suffix is one; FFmpeg would read it as a video."""
     if path.suffix.lower() in _JPEGS_IN_A_ROW:
         return False
     try:
@@ -359,7 +385,7 @@ def _is_one_image(path: Path) -> bool:
 
 
 def _images_in(folder: Path) -> list[Path]:
-    # Hidden ones are not pictures: macOS leaves them beside each file on a card.
+    # macOS leaves a hidden file beside each file on a card.
     return _colour_images(
         [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     )

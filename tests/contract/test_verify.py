@@ -121,11 +121,9 @@ def with_model(copied_bundle, rewrite, bundle):
 )
 def test_whatever_the_model_does_verify_ends_and_says_so(with_model, bundle, make, error, words):
     folder = with_model(make(bundle))
-    begin = time.monotonic()
     with pytest.raises(error, match=words) as caught:
         verify_bundle(folder, threads=1, timeout_s=3.0 if make is endless else 60.0)
     assert "\n" not in str(caught.value)
-    assert time.monotonic() - begin < 60.0
 
 
 @pytest.mark.parametrize("provider", ["onnxruntime", "openvino"])
@@ -170,12 +168,12 @@ def test_a_terminated_verify_leaves_no_process_behind(with_model, bundle):
     folder = with_model(endless(bundle))
     process = subprocess.Popen([sys.executable, "-P", "-c", RUN, "verify", folder])
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    deadline = time.monotonic() + 60
-    while not (found := children.read_text("ascii").split()) and time.monotonic() < deadline:
+    while not (found := children.read_text("ascii").split()):
+        assert process.poll() is None
         time.sleep(0.05)
     (child,) = map(int, found)
     process.send_signal(signal.SIGTERM)
-    assert process.wait(30) == 143
+    assert process.wait() == 143
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
 

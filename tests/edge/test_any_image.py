@@ -1,4 +1,4 @@
-"""Whatever is given as an image: an estimate that says what is wrong, or a defined conversion."""
+"""Any input as an image gives a defined conversion, or an estimate that says what is wrong."""
 
 from collections import Counter
 
@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import array_shapes, arrays, scalar_dtypes
 
 from cvo_edge import Frame, Odometer, Status, open_source
 
-# Of any kind and shape; and such as cameras give, of any content and of a scene.
+# Arrays of any type and shape, and images as cameras give them.
 anything = arrays(scalar_dtypes(), array_shapes(min_dims=0, max_dims=4, max_side=24))
 images = st.one_of(
     arrays(
@@ -55,7 +55,7 @@ def one_of_a_scene(data, scene):
     )
 
 
-def test_an_interval_is_finite_only_where_nothing_speaks_against_it(odometer, scene):
+def test_an_interval_is_finite_only_without_a_reason_against_it(odometer, scene):
     seen = Counter()
 
     @settings(max_examples=300)
@@ -68,7 +68,7 @@ def test_an_interval_is_finite_only_where_nothing_speaks_against_it(odometer, sc
             "image": lambda: data.draw(images),
             "scene": lambda: one_of_a_scene(data, scene),
         }[kind]()
-        # A stream of its own: nothing before it speaks against it.
+        # In a stream of its own, no earlier frame speaks against it.
         (estimate,) = odometer.stream([Frame(image, stamp_ns, "", 0.0)])
         seen[estimate.status] += 1
         finite = np.isfinite([*estimate.lower, *estimate.upper])
@@ -78,13 +78,13 @@ def test_an_interval_is_finite_only_where_nothing_speaks_against_it(odometer, sc
         assert (estimate.pose is None) == (estimate.status is Status.INVALID)
 
     law()
-    # Degraded ones are rare: what is hardly an image seldom has a plausible pose.
+    # Degraded estimates are rare: odd images seldom have a plausible pose.
     assert min(seen[Status.OK], seen[Status.INVALID]) > 50, seen
 
 
 @settings(max_examples=60)
 @given(image=st.none() | anything | images)
-def test_the_next_good_frame_is_as_ever(odometer, scene, image):
+def test_a_bad_frame_does_not_change_the_next_pose(odometer, scene, image):
     (before,) = odometer.stream([scene[0]])
     _, after = odometer.stream([image, scene[0]])
     assert after.pose.to_array().tolist() == before.pose.to_array().tolist()

@@ -127,7 +127,7 @@ def test_every_mode_sees_the_stream_in_its_order(bundle_dir, images, mode):
         Frame(images[3], 250, "", 0.0),
         Frame(other, 400, "", 0.0),
         Frame(images[5], None, "", 0.0),
-        Frame(images[6], 500, "", 0.0, waited_ms=1500.0),
+        Frame(images[6], 500, "", 0.0, queued_ms=1500.0),
         Frame(images[7], 600, "", 0.0),
     ]
     # In live each waits until the one before was seen, or it would be left out.

@@ -1,10 +1,9 @@
-"""How streams use the cores: order, errors in their place, the newest frame."""
+"""Scheduling of streams: order, errors in their place, the newest frame."""
 
 import json
 import subprocess
 import sys
 import threading
-import time
 from itertools import pairwise
 
 import cv2
@@ -13,11 +12,15 @@ import pytest
 
 from cvo_edge import Frame, Odometer, Reason, SourceError, UsageError, open_source
 from cvo_edge.input.capture import READER
-from cvo_edge.scheduling import Newest, Played, in_order, plan
+from cvo_edge.input.newest import Newest, Played
+from cvo_edge.scheduling import in_order, plan
 from cvo_edge.vocabulary import MODES
 
+# Only a defect lets a wait last so long.
+HANGS_S = 120.0
 
-def test_each_mode_uses_as_many_threads_as_it_is_given():
+
+def test_each_mode_uses_the_threads_it_is_given():
     for mode in MODES:
         settings = plan(mode, 2)
         assert settings.threads * settings.workers == 2
@@ -27,10 +30,13 @@ def test_each_mode_uses_as_many_threads_as_it_is_given():
 
 
 def test_results_come_in_the_order_of_their_tasks():
-    delays = np.random.default_rng(0).uniform(0.0, 0.004, 60)
+    done = [threading.Event() for _ in range(60)]
 
     def task(number):
-        time.sleep(delays[number])
+        # Each even task ends after the one behind it.
+        if number % 2 == 0:
+            assert done[number + 1].wait(HANGS_S)
+        done[number].set()
         return number
 
     tasks = (lambda number=number: task(number) for number in range(60))
@@ -76,48 +82,46 @@ def picture_free(number):
 
 
 class Stepping:
-    """Frames that come when a test says so; ``asked`` counts how many were asked for."""
+    """Frames that come when a test says so."""
 
     def __init__(self, count, failure=None):
-        self.go, self.asked, self._count, self._failure = threading.Semaphore(0), 0, count, failure
+        self._go, self._asked = threading.Semaphore(0), threading.Semaphore(0)
+        self._count, self._failure = count, failure
 
     def __iter__(self):
         for number in range(self._count):
-            self.asked += 1
-            self.go.acquire()
+            self._asked.release()
+            self._go.acquire()
             yield picture_free(number)
-        self.asked += 1
+        self._asked.release()
         if self._failure:
             raise self._failure
 
     def give(self, count):
-        """Let so many frames come, and wait until they have been taken."""
-        expected = self.asked + count
-        self.go.release(count)
-        self.wait(expected)
-
-    def wait(self, asked):
-        """Wait until so many frames have been asked for."""
-        deadline = time.monotonic() + 30
-        while self.asked < asked and time.monotonic() < deadline:
-            time.sleep(0.001)
-        assert self.asked == asked
+        """Let so many frames come, one after another, until the next one is asked for."""
+        for _ in range(count):
+            assert self._asked.acquire(timeout=HANGS_S)
+            self._go.release()
+        assert self._asked.acquire(timeout=HANGS_S)
+        self._asked.release()
 
 
 FAILURES = [None, SourceError("camera 0: gave no frame after 6 frames"), SystemExit(3)]
 
 
 @pytest.mark.parametrize("failure", FAILURES)
-def test_the_newest_frame_is_seen_and_the_others_are_counted(failure):
+def test_the_newest_frame_is_seen_and_the_others_are_counted(clock, failure):
     source = Stepping(6, failure)
-    newest = iter(Newest(source))
-    source.go.release()
+    newest = iter(Newest(source, clock=clock))
+    first = threading.Thread(target=source.give, args=(1,))
+    first.start()
     assert next(newest).source == "0"
-    source.wait(2)
+    first.join()
     source.give(3)
+    clock.now = 2.0
     frame = next(newest)
     assert (frame.source, frame.skipped) == ("3", 2)
-    assert frame.waited_ms > 0.0
+    assert frame.age_ms(clock.now) == 2000.0
     source.give(2)
     frame = next(newest)
     assert (frame.source, frame.skipped) == ("5", 1)
@@ -125,12 +129,47 @@ def test_the_newest_frame_is_seen_and_the_others_are_counted(failure):
         next(newest)
 
 
-def test_files_are_played_no_faster_than_their_stamps():
-    begin = time.monotonic()
-    seen = list(Newest(Played(Recorded(4, step_ns=20_000_000))))
-    assert time.monotonic() - begin >= 0.06
-    assert seen[-1].source == "3"
-    assert sum(frame.skipped + 1 for frame in seen) == 4
+def test_a_frame_ages_from_its_arrival_at_the_camera(clock):
+    clock.now = 10.0
+    given = Frame(None, 0, "", 5.0, queued_ms=300.0, arrived_s=9.0)
+    (frame,) = Newest([given], clock=clock)
+    assert frame.age_ms(clock.now) == pytest.approx(1300.0)
+    (frame,) = Newest([Frame(None, 0, "", 5.0)], clock=clock)
+    assert frame.age_ms(clock.now) == pytest.approx(5.0)
+    assert given.since_arrival_ms(9.5) == pytest.approx(500.0)
+
+
+def test_a_frame_that_ages_while_it_is_estimated_is_stale(bundle_dir, clip_dir, clock, monkeypatch):
+    images = [frame.image for frame in list(open_source(str(clip_dir)))[:3]]
+    frames = [Frame(image, None, "", 0.0, arrived_s=0.0) for image in images]
+    delays = iter([0.9, 0.2, 0.0])
+    with Odometer.load(bundle_dir, threads=1) as odometer:
+        odometer._clock, observe = clock, odometer.observe
+
+        def slowly(image, seq):
+            clock.now += next(delays)
+            return observe(image, seq)
+
+        monkeypatch.setattr(odometer, "observe", slowly)
+        found = list(odometer.stream(frames))
+    assert [each.reasons for each in found] == [(), (Reason.FRAME_STALE,), (Reason.FRAME_STALE,)]
+    assert [np.isfinite(each.lower).all() for each in found] == [True, False, False]
+
+
+def test_files_are_played_at_their_stamps_and_late_ones_at_once(clock):
+    seen = []
+    for frame in Played(Recorded(6, step_ns=20_000_000), clock):
+        seen.append(round(clock.now, 6))
+        clock.now += 0.05 if frame.source == "2" else 0.001
+    assert seen == [0.0, 0.02, 0.04, 0.09, 0.091, 0.1]
+
+
+def test_a_play_that_is_stopped_ends(clock):
+    played = Played(Recorded(6, step_ns=20_000_000), clock)
+    frames = iter(played)
+    next(frames)
+    played.stop()
+    assert list(frames) == []
 
 
 class Recorded:
@@ -161,10 +200,8 @@ def test_nothing_reads_on_when_a_live_stream_is_left(bundle_dir):
     assert readers() == []
 
 
-def test_a_video_that_is_left_while_it_is_read_ends_the_process_as_ever(
-    bundle_dir, clip_dir, tmp_path
-):
-    # Large: most of the time the reader is inside of OpenCV.
+def test_a_process_exits_cleanly_while_a_video_is_being_read(bundle_dir, clip_dir, tmp_path):
+    # Large, so that the reader is inside OpenCV most of the time.
     frame = next(iter(open_source(str(clip_dir))))
     path = tmp_path / "large.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (2560, 1920))
@@ -177,9 +214,9 @@ def test_a_video_that_is_left_while_it_is_read_ends_the_process_as_ever(
     assert (done.returncode, done.stderr, len(done.stdout.splitlines())) == (0, "", 1 + 2)
 
 
-def test_what_cannot_be_played_is_refused(bundle_dir, clip_dir):
+def test_a_recording_without_stamps_is_not_played_live(bundle_dir, clip_dir):
     odometer = Odometer.load(bundle_dir, mode="live")
-    with pytest.raises(UsageError, match="expected a camera, or frames with stamps"):
+    with pytest.raises(UsageError, match="the frames have no stamps"):
         list(odometer.stream(open_source(str(clip_dir))))
     with pytest.raises(UsageError, match="mode: expected one of live, latency, throughput"):
         Odometer.load(bundle_dir, mode="fast")
@@ -192,20 +229,18 @@ def intervals(estimates):
     }
 
 
-def test_every_mode_gives_the_same_numbers(bundle_dir, clip_dir):
+def test_every_mode_gives_the_same_numbers(bundle_dir, clip_dir, clock):
     found = {}
     for mode in MODES:
         with Odometer.load(bundle_dir, mode=mode, threads=2) as odometer:
+            odometer._clock = clock
             found[mode] = list(odometer.stream(open_source(str(clip_dir), fps=100)))
     latency, throughput = (intervals(found[mode]) for mode in ("latency", "throughput"))
     assert list(throughput.items()) == list(latency.items())
-    # Where a frame takes seconds, the one that has waited for it is old by then.
-    live = [each for each in found["live"] if each.reasons != (Reason.FRAME_STALE,)]
-    assert live
-    assert intervals(live).items() <= latency.items()
+    assert intervals(found["live"]).items() <= latency.items()
     numbers = [each.seq for each in found["live"]]
     assert all(a < b for a, b in pairwise(numbers))
-    assert numbers[-1] == 49  # the last one is never left out
+    assert numbers[-1] == 49  # the last one is never dropped
 
 
 def test_a_caller_may_write_the_next_image_into_the_same_memory(bundle_dir, clip_dir):

@@ -48,9 +48,7 @@ def test_a_process_that_dies_is_a_failure_of_its_task(tmp_path):
 
 
 def _wait_for(condition):
-    end = time.monotonic() + 60
     while not condition():
-        assert time.monotonic() < end
         time.sleep(0.05)
 
 
@@ -84,7 +82,7 @@ def test_no_process_is_left_behind_by_a_signal(tmp_path, number):
         children = [int(path.name) for path in tmp_path.iterdir()]
         assert all(_alive(pid) for pid in children)
         parent.send_signal(number)
-        assert parent.wait(60) != 0
+        assert parent.wait() != 0
         _wait_for(lambda: not any(_alive(pid) for pid in children))
         assert len(list(tmp_path.iterdir())) == 2
     finally:
