@@ -268,7 +268,7 @@ class Odometer:
         """Everything that does not depend on the frames before; safe in several threads."""
         waited_ms = max(frame.read_ms, frame.since_arrival_ms(self._clock.now_s()))
         start = perf_counter()
-        observation = self._observer.observe(frame.image, seq)
+        observation = self.observe(frame.image, seq)
         observed = perf_counter()
         usable = observation.fault is None and observation.doubt is None
         found = self.conformal_set(observation) if usable else unbounded_set()

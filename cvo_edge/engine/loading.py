@@ -52,8 +52,8 @@ class Bundle:
     def __repr__(self) -> str:
         spec, calibration = self.calibration.model, self.calibration
         return (
-            f"<Bundle {calibration.name}: {calibration.method}, {spec.precision} on "
-            f"{spec.provider}, sha256 {spec.sha256[:12]}...>"
+            f"<Bundle {calibration.name!r}: {calibration.method}, {spec.precision} on "
+            f"{spec.provider}>"
         )
 
 

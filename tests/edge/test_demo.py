@@ -41,10 +41,8 @@ def test_it_needs_nothing_but_the_package_and_leaves_nothing_but_a_picture(tmp_p
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
     assert lines[0].startswith("synthetic-room-cjp-int8: digests match")
-    assert [line.split()[0] for line in lines[2:7]] == [
-        *(f"frame-{number:06}.color.jpg" for number in range(4)),
-        "...",
-    ]
+    shown = [line.split()[0] for line in lines if line.startswith(("frame-", "..."))]
+    assert shown == [*(f"frame-{number:06}" for number in range(4)), "..."]
     (coverage,) = [line for line in lines if line.startswith("coverage")]
     assert coverage.endswith("of 50 frames")
     (expected,) = [line for line in lines if line.startswith("expected")]
