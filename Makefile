@@ -4,11 +4,12 @@ PYTHON ?= python3
 TORCH_PIP_OPTIONS ?=
 VENV := .venv
 DEMO_VENV := .venv-demo
+DOCS_VENV := .venv-docs
 METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 RUNTIME := $(shell find cvo_edge -type f -not -name "*.pyc")
 
-.PHONY: help demo test check bench soak fuzz arm64 avx2 format clean
+.PHONY: help demo test check docs bench soak fuzz arm64 avx2 format clean
 
 help:
 	@echo "make demo    install the runtime alone and run the demonstration of every method"
@@ -16,6 +17,7 @@ help:
 	@echo "make arm64   test the runtime on an emulated 64-bit ARM, and compare its numbers with this machine's"
 	@echo "make avx2    the same on an x86-64 without VNNI (both: Linux with apt-get, as root for the emulator)"
 	@echo "make check   lint, formatting, types and import rules"
+	@echo "make docs    build the documentation into build/site, strictly and without requests"
 	@echo "make bench   compare speed, memory and start side by side; an hour on a quiet machine"
 	@echo "make soak    a million frames: does memory grow? half an hour"
 	@echo "make fuzz    ten thousand damaged models, artifacts and sensors, a thousand kills; half an hour"
@@ -60,6 +62,15 @@ check: $(VENV)/.installed
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
+$(DOCS_VENV)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(DOCS_VENV)
+	$(DOCS_VENV)/bin/python -m pip install --quiet --editable ".[docs]"
+	@touch $@
+
+docs: $(DOCS_VENV)/.installed
+	NO_MKDOCS_2_WARNING=1 $(DOCS_VENV)/bin/mkdocs build --strict --quiet
+	@echo "build/site/index.html"
+
 # One after the other: nothing may run beside a measurement.
 bench: $(VENV)/.installed
 	$(VENV)/bin/python bench/networks.py
@@ -84,4 +95,4 @@ format: $(VENV)/.installed
 	$(VENV)/bin/ruff format .
 
 clean:
-	rm -rf $(VENV) $(DEMO_VENV) .opencv4 .boards build/bench $(addprefix demo-,$(METHODS:=.png)) cvo-edge-demo.png
+	rm -rf $(VENV) $(DEMO_VENV) $(DOCS_VENV) .opencv4 .boards build/bench build/site $(addprefix demo-,$(METHODS:=.png)) cvo-edge-demo.png

@@ -32,8 +32,12 @@ def test_every_program_has_its_results_and_no_figure_is_left_open() -> None:
         assert not re.search(r"@[A-Z]+@", page.read_text("utf-8")), page
 
 
-def test_the_readme_has_the_goals_as_measured() -> None:
-    assert printed("goals") in (ROOT / "README.md").read_text("utf-8")
+def test_the_page_on_speed_has_the_goals_as_measured() -> None:
+    assert printed("goals") in (ROOT / "docs" / "performance.md").read_text("utf-8")
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 150
 
 
 def test_the_page_on_speed_has_every_table_as_measured() -> None:
