@@ -1,28 +1,20 @@
-# Each target does all of its own set-up: a fresh machine needs Python >= 3.11 with venv, pip and make.
+# Each target sets up what it needs; a fresh machine needs Python >= 3.11 with venv, pip and make.
 PYTHON ?= python3
-# Options for installing torch, e.g. the index of its CPU wheels.
+# pip options for installing torch, for example the index of its CPU wheels.
 TORCH_PIP_OPTIONS ?=
 VENV := .venv
 DEMO_VENV := .venv-demo
 DOCS_VENV := .venv-docs
+RELEASE_VENV := .venv-release
+LOWEST_VENV := .venv-lowest
 METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 RUNTIME := $(shell find cvo_edge -type f -not -name "*.pyc")
 
 .PHONY: help demo test check docs bench soak fuzz arm64 avx2 format clean
 
-help:
-	@echo "make demo    install the runtime alone and run the demonstration of every method"
-	@echo "make test    install both packages and run the test-suite (CVO_DATA: real data, optional)"
-	@echo "make arm64   test the runtime on an emulated 64-bit ARM, and compare its numbers with this machine's"
-	@echo "make avx2    the same on an x86-64 without VNNI (both: Linux with apt-get, as root for the emulator)"
-	@echo "make check   lint, formatting, types and import rules"
-	@echo "make docs    build the documentation into build/site, strictly and without requests"
-	@echo "make bench   compare speed, memory and start side by side; an hour on a quiet machine"
-	@echo "make soak    a million frames: does memory grow? half an hour"
-	@echo "make fuzz    ten thousand damaged models, artifacts and sensors, a thousand kills; half an hour"
-	@echo "make format  reformat the code"
-	@echo "make clean   remove the virtual environments, emulated boards and networks of make bench"
+help: ## list all targets
+	@awk -F ':.*## ' '/^[a-z0-9 -]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 # Installed as users do, not editable: the demonstration proves that the wheel holds its data.
 $(DEMO_VENV)/.installed: pyproject.toml $(RUNTIME)
@@ -37,7 +29,7 @@ $(VENV)/.installed: pyproject.toml export/pyproject.toml
 	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable "./export[plot,ray]"
 	@touch $@
 
-demo: $(DEMO_VENV)/.installed $(addprefix demo-,$(METHODS))
+demo: $(DEMO_VENV)/.installed $(addprefix demo-,$(METHODS)) ## install the runtime without torch and run the demonstration of every method
 	@echo "== the packaged bundle"
 	$(DEMO_VENV)/bin/cvo-edge demo
 
@@ -45,18 +37,18 @@ demo-%: $(DEMO_VENV)/.installed
 	@echo "== synthetic-room-$*"
 	$(DEMO_VENV)/bin/cvo-edge demo $(BUNDLE)-$* --picture demo-$*.png
 
-# Another release of OpenCV, for the tests that compare what both make of the same files.
+# A second release of OpenCV, for the tests that compare how both decode the same files.
 .opencv4: $(VENV)/.installed
 	$(VENV)/bin/python -m pip install --quiet --no-deps --upgrade --target $@ opencv-python-headless==4.10.0.84
 	@touch $@
 
-test: $(VENV)/.installed .opencv4
+test: $(VENV)/.installed .opencv4 ## install both packages and run all tests (CVO_DATA, CVO_WEIGHTS: optional real data)
 	$(VENV)/bin/python -m pytest
 
-arm64 avx2: $(VENV)/.installed
+arm64 avx2: $(VENV)/.installed ## test the runtime on an emulated processor and compare the numbers (Linux, apt-get, root)
 	$(VENV)/bin/python -m boards $@ --json bench/results/boards/$@.json
 
-check: $(VENV)/.installed
+check: $(VENV)/.installed ## check lint, formatting, types and import rules
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
@@ -67,12 +59,12 @@ $(DOCS_VENV)/.installed: pyproject.toml
 	$(DOCS_VENV)/bin/python -m pip install --quiet --editable ".[docs]"
 	@touch $@
 
-docs: $(DOCS_VENV)/.installed
+docs: $(DOCS_VENV)/.installed ## build the documentation into build/site, strictly and without requests
 	NO_MKDOCS_2_WARNING=1 $(DOCS_VENV)/bin/mkdocs build --strict --quiet
 	@echo "build/site/index.html"
 
-# One after the other: nothing may run beside a measurement.
-bench: $(VENV)/.installed
+# One after another: nothing may run during a measurement.
+bench: $(VENV)/.installed ## measure speed, memory and start-up against other engines; one hour on a quiet machine
 	$(VENV)/bin/python bench/networks.py
 	$(VENV)/bin/python bench/frame.py
 	$(VENV)/bin/python bench/stream.py
@@ -80,19 +72,77 @@ bench: $(VENV)/.installed
 	$(VENV)/bin/python bench/scaling.py
 	$(VENV)/bin/python bench/peers.py
 	$(VENV)/bin/python bench/uncertainty_peers.py
-	$(VENV)/bin/python bench/speed_tables.py
 	$(VENV)/bin/python bench/goals.py
 
-soak: $(VENV)/.installed
+soak: $(VENV)/.installed ## process a million frames and watch memory; half an hour
 	$(VENV)/bin/python bench/soak.py
 
-# One kind alone: .venv/bin/python -m fuzz NAME, or NAME=TRIALS.
-fuzz: $(VENV)/.installed
+# A single kind: .venv/bin/python -m fuzz NAME, or NAME=TRIALS.
+fuzz: $(VENV)/.installed ## try damaged models, bundles, images and cameras, and killed processes; half an hour
 	$(VENV)/bin/python -m fuzz
 
-format: $(VENV)/.installed
+format: $(VENV)/.installed ## reformat the code
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
-clean:
-	rm -rf $(VENV) $(DEMO_VENV) $(DOCS_VENV) .opencv4 .boards build/bench build/site $(addprefix demo-,$(METHODS:=.png)) cvo-edge-demo.png
+clean: ## delete everything that these targets create
+	rm -rf $(VENV) $(DEMO_VENV) $(DOCS_VENV) $(RELEASE_VENV) $(LOWEST_VENV) .opencv4 .boards build dist export/build
+	rm -rf *.egg-info export/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -f $(addprefix demo-,$(METHODS:=.png)) cvo-edge-demo.png
+
+# --- Packages -------------------------------------------------------------------------------------
+
+.PHONY: wheel-demo test-lowest constraints release
+
+# setuptools would pack what an earlier build left in build/lib.
+wheel-demo: ## build the runtime's wheel, install it alone and run its demonstration in an empty folder
+	rm -rf build/lib build/bdist.* build/wheel-demo
+	mkdir -p build/wheel-demo/empty
+	$(PYTHON) -m venv build/wheel-demo/venv
+	build/wheel-demo/venv/bin/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel-demo .
+	build/wheel-demo/venv/bin/python -m pip install --quiet build/wheel-demo/cvo_edge-*.whl
+	cd build/wheel-demo/empty && env -u PYTHONPATH ../venv/bin/cvo-edge demo
+
+$(LOWEST_VENV)/.installed: pyproject.toml constraints/lowest.txt
+	$(PYTHON) -m venv $(LOWEST_VENV)
+	$(LOWEST_VENV)/bin/python -m pip install --quiet --constraint constraints/lowest.txt --editable ".[test]" onnx
+	@touch $@
+
+# tests/validity/test_coverage.py and tests/export need the training side.
+test-lowest: $(LOWEST_VENV)/.installed ## run the runtime's tests with the lowest versions that pyproject.toml allows
+	$(LOWEST_VENV)/bin/python -m pytest tests/edge tests/contract tests/validity/test_oracles.py
+
+constraints: $(VENV)/.installed ## pin the installed dependencies of both packages in constraints/
+	$(VENV)/bin/python constraints/refresh.py
+
+$(RELEASE_VENV)/.installed: constraints/release.txt
+	$(PYTHON) -m venv $(RELEASE_VENV)
+	$(RELEASE_VENV)/bin/python -m pip install --quiet --requirement constraints/release.txt
+	@touch $@
+
+# From the last commit, not from the working tree; the same commit gives the same bytes.
+release: export SOURCE_DATE_EPOCH = $(shell git log -1 --format=%ct)
+release: SOURCE := build/release/source
+release: VERSION = $(shell git show HEAD:cvo_edge/__init__.py | sed -n 's/^__version__ = "\(.*\)"/\1/p')
+release: $(RELEASE_VENV)/.installed ## build wheels and sdists of both packages, SBOMs and checksums into dist/
+	rm -rf build/release dist
+	mkdir -p $(SOURCE) build/release/sdist dist
+	git -c tar.umask=0022 archive HEAD | tar --extract --preserve-permissions --directory=$(SOURCE)
+	umask 022; for project in $(SOURCE) $(SOURCE)/export; do \
+	    $(RELEASE_VENV)/bin/python -m build --no-isolation --outdir dist $$project || exit 1; \
+	done
+	for name in cvo_edge-$(VERSION) cvo_export-$(VERSION); do \
+	    tar --extract --file=dist/$$name.tar.gz --directory=build/release/sdist && \
+	    tar --create --format=ustar --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner \
+	        --mode=u+rw,go+r,go-w --directory=build/release/sdist $$name | gzip -9 --no-name > dist/$$name.tar.gz || exit 1; \
+	done
+	$(RELEASE_VENV)/bin/twine check --strict dist/*
+	$(PYTHON) -m venv --without-pip build/release/venv
+	$(RELEASE_VENV)/bin/python -m pip --python build/release/venv/bin/python install --quiet \
+	    --constraint $(SOURCE)/constraints/runtime.txt dist/cvo_edge-$(VERSION)-py3-none-any.whl
+	sed -i 's/^dynamic = \["version"\]/version = "$(VERSION)"/' $(SOURCE)/pyproject.toml $(SOURCE)/export/pyproject.toml
+	$(RELEASE_VENV)/bin/cyclonedx-py environment --output-reproducible --pyproject $(SOURCE)/pyproject.toml \
+	    --output-file dist/cvo_edge-$(VERSION).cdx.json build/release/venv/bin/python
+	$(RELEASE_VENV)/bin/cyclonedx-py requirements --output-reproducible --pyproject $(SOURCE)/export/pyproject.toml \
+	    --output-file dist/cvo_export-$(VERSION).cdx.json $(SOURCE)/constraints/export.txt
+	cd dist && sha256sum *.whl *.tar.gz *.json > SHA256SUMS

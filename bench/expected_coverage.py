@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from networks import ARTIFACTS, METHODS, PRECISIONS, WORK, demonstration
 from numpy.typing import NDArray
-from rounds import commit
+from provenance import commit
 
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.input.decoding import decode_image

@@ -20,13 +20,13 @@ from time import perf_counter
 
 import numpy as np
 from networks import pose_alone
+from provenance import write_result
 
-from cvo_edge.bundle.reading import read_bundle
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.engine.session import Session
 from cvo_edge.input import preprocess
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
-from cvo_edge.programs.measure import environment
 
 LOAD = """
 import sys
@@ -101,11 +101,11 @@ def main() -> None:
         "model_mib": round(len(bundle.model_bytes) / 2**20, 2),
         "without_mib": round(len(cut) / 2**20, 2),
         "load_mib": {"whole": load_mib(bundle.model_bytes), "without": load_mib(cut)},
-        "environment": environment(whole.threads),
+        "threads": whole.threads,
     }
     print(json.dumps(report, indent=1))
     if arguments.json:
-        arguments.json.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
+        write_result(arguments.json, report)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from networks import (
 )
 from rounds import Array, figures, interleaved, ratio, write_report
 
-from cvo_edge.bundle.reading import Bundle, read_bundle
+from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.session import Session
 from cvo_edge.input import preprocess
 from cvo_edge.input.decoding import decode_image

@@ -1,24 +1,23 @@
-"""The goals for two cores, beside what was measured: a table from ``results/speed``.
+"""The goals for two cores beside what was measured.
 
     python bench/goals.py
 
-Reads what the other programs of this folder wrote and prints the README's table. A goal that was
-missed is named as such; what was not measured here is a dash.
+Reads the results of the other programs of this folder and prints the table ``goals`` of
+``bench/tables.py``. A missed goal is marked; a dash stands for what was not measured.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markdown import table
 from networks import METHODS
-from rounds import RESULTS
+from provenance import RESULTS, read_result, result_files
 
 MOBILENET, RESNET = "mobilenetv2_100", "resnet34"
-PRECISION_RESULTS = RESULTS.parent / "int8"
 
 
 @dataclass(frozen=True)
@@ -49,10 +48,9 @@ class Goal:
 
 def report(name: str) -> dict[str, Any] | None:
     """Return the results of one program, None where it has not been run."""
-    path = RESULTS / f"{name}.json"
-    if not path.exists():
+    if not (RESULTS / "speed" / f"{name}.json").exists():
         return None
-    results: dict[str, Any] = json.loads(path.read_text("utf-8"))["results"]
+    results: dict[str, Any] = read_result("speed", name)["results"]
     return results
 
 
@@ -78,8 +76,8 @@ def both(low: float, high: float) -> dict[str, float]:
 def worst_width(backbone: str) -> float | None:
     """Return the largest ratio of mean widths, int8 over fp32, of the methods' medians."""
     ratios: dict[tuple[str, str], list[float]] = {}
-    for path in sorted(PRECISION_RESULTS.glob("*.json")):
-        found = json.loads(path.read_text("utf-8"))
+    for path in result_files("precision"):
+        found = read_result("precision", path.stem)
         if found["backbone"] == backbone:
             ratios.setdefault((found["dataset"], found["method"]), []).append(found["width_ratio"])
     return max((float(np.median(values)) for values in ratios.values()), default=None)
@@ -101,7 +99,7 @@ def goals() -> list[Goal]:
     """Return the goals, in the order of the design."""
     rows = [
         Goal(
-            f"array to intervals over the raw call, {method}",
+            f"array to interval / raw call, {method}",
             at("frame", "{}", method, "fp32", "step_over_raw", "median"),
             both(1.05, 1.05),
         )
@@ -109,7 +107,7 @@ def goals() -> list[Goal]:
     ]
     rows.append(
         Goal(
-            "JPEG file to JSON record over the raw call, cjp",
+            "JPEG file to JSON record / raw call, cjp",
             at("frame", "{}", "cjp", "fp32", "record_over_raw", "median"),
             both(1.5, 1.1),
         )
@@ -117,12 +115,12 @@ def goals() -> list[Goal]:
     for method in METHODS:
         rows += [
             Goal(
-                f"demonstration's network, {method}: array to intervals less the raw call, ms",
+                f"demonstration network, {method}: array to interval - raw call, ms",
                 at("frame", "demonstration", method, "fp32", "step_minus_raw_ms", "median"),
                 {MOBILENET: 0.25},
             ),
             Goal(
-                f"demonstration's network, {method}: JPEG file to JSON record over the raw call",
+                f"demonstration network, {method}: JPEG file to JSON record / raw call",
                 at("frame", "demonstration", method, "fp32", "record_over_raw", "median"),
                 {MOBILENET: 1.6},
             ),
@@ -138,80 +136,80 @@ def goals() -> list[Goal]:
     return [
         *rows,
         Goal(
-            "raw call: float32 over 8 bits",
+            "raw call: float32 / 8 bits",
             at("frame", "{}", "cjp", "fp32_over_int8", "median"),
             both(1.4, 2.5),
             at_least=True,
             form="{:.2f}",
         ),
         Goal(
-            "width of trained networks: 8 bits over float32, the widest method",
+            "mean width: 8 bits / float32, worst method",
             worst_width,
             both(1.1, 1.1),
         ),
         Goal(
-            "files a second in mode throughput in 8 bits, over a naive script in float32",
+            "files a second: mode throughput in 8 bits / naive script in float32",
             at("stream", "{}", "throughput", "throughput int8", "naive_over_this", "median"),
             {MOBILENET: 2.5},
             at_least=True,
             form="{:.2f}",
         ),
         Goal(
-            "one frame against 30 passes of MC-dropout, the fastest form",
+            "30 passes of MC-dropout (fastest form) / one frame",
             at("uncertainty_peers", "{}", "mc-dropout", "fastest_over_ours"),
             both(20, 20),
             at_least=True,
             form="{:.1f}",
         ),
         Goal(
-            "one frame against five networks, the fastest form",
+            "five networks (fastest form) / one frame",
             at("uncertainty_peers", "{}", "ensemble", "fastest_over_ours"),
             both(5, 5),
             at_least=True,
             form="{:.1f}",
         ),
         Goal(
-            "interval score over that of MC-dropout, networks cut short, the worse recording",
+            "interval score / MC-dropout, truncated networks, worse recording",
             worst_score("mc-dropout"),
             {MOBILENET: 1.0},
         ),
         Goal(
-            "interval score over that of five networks, cut short, the worse recording",
+            "interval score / five networks, truncated networks, worse recording",
             worst_score("ensemble"),
             {MOBILENET: 1.0},
         ),
         Goal(
-            "processor time a frame at 30 a second over onnxruntime's, float32, 2 threads",
+            "processor time at 30 frames a second / onnxruntime: float32, 2 threads",
             at("stream", "{}", "camera", "live fp32, 2", "over_onnxruntime", "median"),
             both(0.3, 0.3),
         ),
         Goal(
-            "the same, 8 bits on 1 thread over float32 on 2",
+            "processor time at 30 frames a second / onnxruntime: 8 bits, 1 thread",
             at("stream", "{}", "camera", "live int8, 1", "over_onnxruntime", "median"),
             both(0.15, 0.15),
         ),
         Goal(
-            "load with a warm cache over plain onnxruntime, float32",
+            "load with a warm model cache / onnxruntime, float32",
             at("start", "{}", "load", "cvo-edge fp32", "load_ms", "over_onnxruntime"),
             both(0.45, 0.15),
         ),
         Goal(
-            "anonymous memory, 8 bits over plain onnxruntime in float32",
+            "anonymous memory: 8 bits / onnxruntime in float32",
             at("start", "{}", "load", "cvo-edge int8", "anonymous_mib", "over_onnxruntime"),
             {MOBILENET: 0.6},
         ),
         Goal(
-            "anonymous memory over plain onnxruntime, float32",
+            "anonymous memory / onnxruntime, float32",
             at("start", "{}", "load", "cvo-edge fp32", "anonymous_mib", "over_onnxruntime"),
             {RESNET: 0.2},
         ),
         Goal(
-            "fresh process to first interval over the smallest script",
+            "fresh process to first interval / smallest script",
             at("start", "{}", "process", "over_script", "median"),
             both(1.15, 1.15),
         ),
         Goal(
-            "growth of memory from the second to the last tenth of a million frames, MiB",
+            "growth of memory, second to last tenth of a million frames, MiB",
             at("soak", "growth_mib", "rss"),
             {MOBILENET: 10},
             form="{:.1f}",
@@ -219,12 +217,10 @@ def goals() -> list[Goal]:
     ]
 
 
-def main() -> None:
-    """Print the table."""
-    rows = [["what", "goal", "MobileNetV2", "ResNet34"], ["---"] * 4]
-    rows += [goal.cells() for goal in goals()]
-    print(*(f"| {' | '.join(row)} |" for row in rows), sep="\n")
+def goals_table() -> str:
+    """Return all goals as a Markdown table."""
+    return table(["what", "goal", "MobileNetV2", "ResNet34"], [goal.cells() for goal in goals()])
 
 
 if __name__ == "__main__":
-    main()
+    print(goals_table())

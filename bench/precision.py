@@ -9,11 +9,11 @@ evaluates both on the run's test frames. What they save in time is in ``bench/fr
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from provenance import write_result
 
 from cvo_edge.bundle.format import Precision
 from cvo_edge.bundle.reading import read_calibration
@@ -85,7 +85,7 @@ def main() -> None:
             flush=True,
         )
     if arguments.json:
-        arguments.json.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
+        write_result(arguments.json, report)
 
 
 if __name__ == "__main__":

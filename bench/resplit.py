@@ -12,14 +12,14 @@ before it (antithetic variates): what one half of the frames lends, the other gi
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from provenance import write_result
 
-from cvo_edge.bundle.reading import read_bundle
 from cvo_edge.conformal import conformal_quantile, conformal_rank
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.odometer import Odometer
 from cvo_export.bundles.thresholds import observe
 from cvo_export.data.splits import same_split
@@ -82,7 +82,7 @@ def main() -> None:
             "joint_coverage": jointly,
             "largest_difference": worst,
         }
-        arguments.json.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
+        write_result(arguments.json, report)
 
 
 if __name__ == "__main__":

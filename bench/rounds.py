@@ -6,21 +6,14 @@ that; a median of ratios within a round does not.
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC, datetime
-from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from provenance import RESULTS, write_result
 
-from cvo_edge.programs.measure import environment
-
-RESULTS = Path(__file__).parent / "results" / "speed"
 Array = NDArray[np.float64]
 Array8 = NDArray[np.uint8]
 T = TypeVar("T")
@@ -90,30 +83,7 @@ def ratio(numerator: Array, denominator: Array) -> dict[str, float]:
 
 def write_report(name: str, results: Mapping[str, Any], **settings: object) -> None:
     """Write ``results/speed/NAME.json``: figures, and all that a reader needs to judge them."""
-    report = {
-        "command": " ".join(["python", f"bench/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
-        "settings": settings,
-        "date": datetime.now(UTC).date().isoformat(),
-        "commit": commit(),
-        "environment": environment(),
-        "results": results,
-    }
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    target = RESULTS / f"{name}.json"
-    target.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
-    print(f"-> {target}")
-
-
-def commit() -> str:
-    """Return which commit of the repository this is, with a plus where files differ from it."""
-    command = ["git", "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
-    try:
-        done = subprocess.run(
-            command, cwd=RESULTS.parents[2], capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return done.stdout.strip()
+    write_result(RESULTS / "speed" / f"{name}.json", {"settings": settings, "results": results})
 
 
 def _four(value: float) -> float:

@@ -20,7 +20,8 @@ from networks import ROOM, WORK, demonstration, images
 from rounds import figures, write_report
 
 from cvo_edge.bundle.format import CONFIDENCES as LEVELS
-from cvo_edge.bundle.reading import encode_calibration, read_bundle, read_calibration
+from cvo_edge.bundle.reading import encode_calibration, read_calibration
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.odometer import Odometer
 from cvo_edge.sets import Scope
 from cvo_export.networks.directional import Choice, RegionNetwork

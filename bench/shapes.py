@@ -12,7 +12,6 @@ at one x, with samples) and prints coverage, its 99 % band and mean area.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -22,11 +21,12 @@ import matplotlib as mpl
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from provenance import write_result
 from torch import Tensor, nn
 
 from cvo_edge.conformal import conformal_quantile
+from cvo_export.bundles.figures import coverage_band
 from cvo_export.bundles.volume import union_log_volume
-from cvo_export.evaluate import coverage_band
 from cvo_export.networks.directional import (
     Choice,
     RegionConfig,
@@ -266,7 +266,7 @@ def main() -> None:
                 )
     if arguments.json:
         report = {"confidence": CONFIDENCE, "coverage_band": band, "results": results}
-        arguments.json.write_text(json.dumps(report, indent=1) + "\n", "utf-8")
+        write_result(arguments.json, report)
 
 
 if __name__ == "__main__":

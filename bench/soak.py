@@ -31,7 +31,6 @@ from cvo_edge.odometer import Odometer
 from cvo_edge.output.sinks import Sink
 from cvo_edge.programs.measure import memory_mib
 from cvo_edge.programs.run import RunSummary, run
-from cvo_edge.scheduling import Mode
 
 METHOD, FRAMES, READINGS = "cjp", 1_000_000, 100
 CLIP = ARTIFACTS / "synthetic-room-clip"
@@ -64,7 +63,7 @@ def main() -> None:
     count = int(sys.argv[1]) if len(sys.argv) > 1 else FRAMES
     readings: list[dict[str, float]] = []
     with (
-        Odometer.load(demonstration(METHOD, "int8"), mode=Mode.THROUGHPUT) as odometer,
+        Odometer.load(demonstration(METHOD, "int8"), mode="throughput") as odometer,
         Sink(os.devnull, "jsonl") as sink,
     ):
         summary = RunSummary(odometer.chart.dof, 0.9, "marginal", with_truth=True)
@@ -95,7 +94,7 @@ def main() -> None:
     }
     print(results)
     name = "soak" if count == FRAMES else f"soak-{count}"
-    write_report(name, results, method=METHOD, precision="int8", mode=Mode.THROUGHPUT)
+    write_report(name, results, method=METHOD, precision="int8", mode="throughput")
 
 
 if __name__ == "__main__":

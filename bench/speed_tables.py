@@ -1,22 +1,19 @@
-"""Print the tables of ``docs/performance.md`` from ``results/speed`` and ``results/boards``.
+"""Tables of ``results/speed`` and ``results/boards`` for ``bench/tables.py``.
 
-    python bench/speed_tables.py
-
-A table whose program has not been run is left out.
+Figures are medians, with 95th percentiles in brackets.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
+from markdown import table
 from networks import BACKBONES
-from rounds import RESULTS
+from provenance import read_result
 
-BOARDS = RESULTS.parent / "boards"
 SHORT = {"mobilenetv2_100": "MobileNetV2", "resnet34": "ResNet34", "demonstration": "cut short"}
 
 Rows = Iterator[list[str]]
@@ -35,8 +32,9 @@ def two(found: Mapping[str, float], digits: int = 2) -> str:
 def frame(results: dict[str, Any]) -> Rows:
     """One frame of every bundle."""
     yield [
-        *("network", "method", "", "raw call ms", "array to interval over it", "less it, ms"),
-        *("file to record over it", "cost of uncertainty", "after the network, ms"),
+        *("network", "method", "", "raw call, ms", "array to interval / raw call"),
+        *("array to interval - raw call, ms", "file to record / raw call", "cost of uncertainty"),
+        "after the network, ms",
     ]
     for name, label in SHORT.items():
         for method, found in results[name].items():
@@ -60,14 +58,14 @@ def _frame_cells(found: dict[str, Any]) -> list[str]:
 def precision(results: dict[str, Any]) -> Rows:
     """What 8 bits save in the bare call."""
     methods = list(results[BACKBONES[0]])
-    yield ["float32 over 8 bits, raw call", *methods]
+    yield ["raw call: float32 / 8 bits", *methods]
     for name, label in SHORT.items():
         yield [label, *(two(results[name][m]["fp32_over_int8"]) for m in methods)]
 
 
 def throughput(results: dict[str, Any]) -> Rows:
     """JPEG files to records."""
-    yield ["network", "files to records", "ms a frame", "frames a second", "naive over this"]
+    yield ["network", "files to records", "ms a frame", "frames a second", "naive script / this"]
     for name in BACKBONES:
         for what, row in results[name]["throughput"].items():
             cells = [two(row["ms_per_frame"]), number(row["frames_per_second"], 0)]
@@ -77,8 +75,8 @@ def throughput(results: dict[str, Any]) -> Rows:
 def camera(results: dict[str, Any]) -> Rows:
     """A steady camera."""
     yield [
-        *("network", "30 frames a second", "processor ms a frame", "over onnxruntime's"),
-        *("age of a frame, ms", "left out"),
+        *("network", "30 frames a second", "processor ms a frame", "/ onnxruntime"),
+        *("age of a frame, ms", "dropped"),
     ]
     for name in BACKBONES:
         for what, row in results[name]["camera"].items():
@@ -90,7 +88,7 @@ def camera(results: dict[str, Any]) -> Rows:
 def neighbour(results: dict[str, Any]) -> Rows:
     """Steps with and without a busy process beside them."""
     calls = list(results[BACKBONES[0]]["neighbour"]["alone"])
-    yield ["network", "ms of a step: mode, threads", *calls]
+    yield ["network", "ms of a step in mode, threads", *calls]
     for name in BACKBONES:
         for what, row in results[name]["neighbour"].items():
             yield [SHORT[name], what, *(two(row[call]) for call in calls)]
@@ -99,8 +97,8 @@ def neighbour(results: dict[str, Any]) -> Rows:
 def load(results: dict[str, Any]) -> Rows:
     """Loading and memory."""
     yield [
-        *("network", "", "load ms", "over onnxruntime"),
-        *("anonymous MiB", "over onnxruntime"),
+        *("network", "", "load, ms", "/ onnxruntime"),
+        *("anonymous memory, MiB", "/ onnxruntime"),
     ]
     for name in BACKBONES:
         for what, row in results[name]["load"].items():
@@ -114,7 +112,7 @@ def load(results: dict[str, Any]) -> Rows:
 
 def process(results: dict[str, Any]) -> Rows:
     """Fresh processes."""
-    yield ["network", "smallest script, ms", "`cvo-edge run`, ms", "over the script"]
+    yield ["network", "smallest script, ms", "`cvo-edge run`, ms", "/ script"]
     for name in BACKBONES:
         row = results[name]["process"]
         cells = [two(row["script_ms"], 0), two(row["cvo_edge_ms"], 0)]
@@ -123,7 +121,7 @@ def process(results: dict[str, Any]) -> Rows:
 
 def peers(results: dict[str, Any]) -> Rows:
     """Other engines."""
-    yield ["network", "engine", "", "ms", "over ours", "largest difference"]
+    yield ["network", "engine", "", "ms", "/ ours", "largest difference"]
     for name in BACKBONES:
         for engine, row in results[name].items():
             difference = row.get("largest_difference")
@@ -134,7 +132,7 @@ def peers(results: dict[str, Any]) -> Rows:
 
 def uncertainty(results: dict[str, Any]) -> Rows:
     """MC-dropout and ensembles."""
-    yield ["network", "", "form", "ms", "over ours"]
+    yield ["network", "", "form", "ms", "/ ours"]
     for name in BACKBONES:
         yield [SHORT[name], "ours", "", two(results[name]["ours"]["ms"]), "1"]
         for kind in ("mc-dropout", "ensemble"):
@@ -146,7 +144,7 @@ def uncertainty(results: dict[str, Any]) -> Rows:
 def scaling(results: dict[str, Any]) -> Rows:
     """Cost against settings."""
     yield [
-        *("", "", "raw call ms", "array to interval over it", "uncertainty, ms"),
+        *("setting", "value", "raw call, ms", "array to interval / raw call", "uncertainty, ms"),
         "after the network, ms",
     ]
     labels = {
@@ -174,14 +172,14 @@ def _scaling_cells(row: dict[str, Any]) -> list[str]:
 
 def confidences(results: dict[str, Any]) -> Rows:
     """Cost of confidences."""
-    yield ["confidences stored", "reading calibration.json, ms", "all their sets, ms"]
+    yield ["confidences stored", "reading `calibration.json`, ms", "all their sets, ms"]
     for count, row in results["confidences"].items():
         yield [count, two(row["read_calibration_ms"]), two(row["sets_ms"], 3)]
 
 
 def memory(results: dict[str, Any]) -> Rows:
     """A long run."""
-    yield ["frames", "resident MiB, first and last hundredth", "growth MiB", "descriptors, threads"]
+    yield ["frames", "resident MiB, first and last reading", "growth, MiB", "descriptors, threads"]
     first, last = results["first"], results["last"]
     growth = results["growth"]
     yield [
@@ -195,8 +193,8 @@ def memory(results: dict[str, Any]) -> Rows:
 def board(figures: dict[str, Any]) -> Rows:
     """Largest differences of each bundle on an emulated board, and what it covers there."""
     yield [
-        *("bundle", "scope", "position um", "rotation urad", "bounds over mean width"),
-        *("moved sets", "coverage here", "there"),
+        *("bundle", "scope", "position um", "rotation urad", "bounds / mean width"),
+        *("moved sets", "coverage on this machine", "on the board"),
     ]
     for report in figures["bundles"]:
         for scope, found in report["scopes"].items():
@@ -210,8 +208,8 @@ def board(figures: dict[str, Any]) -> Rows:
             ]
 
 
-# Program that was run -> the tables of its results.
-TABLES: dict[str, tuple[Callable[[dict[str, Any]], Rows], ...]] = {
+# Program -> the tables of its results.
+_TABLES: dict[str, tuple[Callable[[dict[str, Any]], Rows], ...]] = {
     "frame": (frame, precision),
     "stream": (throughput, camera, neighbour),
     "start": (load, process),
@@ -222,28 +220,25 @@ TABLES: dict[str, tuple[Callable[[dict[str, Any]], Rows], ...]] = {
 }
 
 
-def lines(rows: Rows) -> str:
-    """Return rows as a table, the first its head."""
-    head, *body = rows
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body)) + "\n"
+def speed_table(program: str, rows: Callable[[dict[str, Any]], Rows]) -> str:
+    """Return one table of a program's results."""
+    head, *body = rows(read_result("speed", program)["results"])
+    return table(head, body)
 
 
-def tables() -> Iterator[tuple[str, str]]:
-    """Yield what was measured, and its table."""
-    for program, found in TABLES.items():
-        path: Path = RESULTS / f"{program}.json"
-        if path.exists():
-            results = json.loads(path.read_text("utf-8"))["results"]
-            yield from ((f"{program}: {each.__name__}", lines(each(results))) for each in found)
-    for path in sorted(BOARDS.glob("*.json")):
-        yield f"boards: {path.stem}", lines(board(json.loads(path.read_text("utf-8"))))
+def board_table(name: str) -> str:
+    """Return the table of one emulated board."""
+    head, *body = board(read_result("boards", name))
+    return table(head, body)
 
 
-def main() -> None:
-    """Print all of them."""
-    for name, table in tables():
-        print(f"{name}\n\n{table}")
-
-
-if __name__ == "__main__":
-    main()
+# Name of a table -> what makes it.
+TABLES: dict[str, Callable[[], str]] = {
+    **{
+        rows.__name__: partial(speed_table, program, rows)
+        for program, several in _TABLES.items()
+        for rows in several
+    },
+    "board-arm64": partial(board_table, "arm64"),
+    "board-avx2": partial(board_table, "avx2"),
+}

@@ -28,12 +28,11 @@ import onnxruntime
 from networks import BACKBONES, WORK, frames, images, whole_bundle
 from rounds import figures, in_turn, interleaved, ratio, write_report
 
-from cvo_edge.bundle.reading import read_bundle
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
 from cvo_edge.output.sinks import Sink
-from cvo_edge.scheduling import Mode
 
 METHOD, THREADS = "cjp", 2
 ROUNDS, WARM_UP = 15, 2
@@ -106,7 +105,7 @@ def throughput(backbone: str) -> dict[str, Any]:
             "naive int8": naive(as_it_comes(eight, THREADS), WORK / "naive.jsonl"),
         }
         for precision in ("fp32", "int8"):
-            for mode in (Mode.LATENCY, Mode.THROUGHPUT):
+            for mode in ("latency", "throughput"):
                 bundle = read_bundle(whole_bundle(METHOD, backbone, precision))
                 odometer = stack.enter_context(Odometer(bundle, threads=THREADS, mode=mode))
                 calls[f"{mode} {precision}"] = streamed(odometer, sink)
@@ -146,7 +145,7 @@ def camera(backbone: str) -> dict[str, Any]:
         calls["onnxruntime"] = paced(as_it_comes(whole_bundle(METHOD, backbone), THREADS))
         for precision, threads in (("fp32", THREADS), ("int8", THREADS), ("int8", 1)):
             bundle = read_bundle(whole_bundle(METHOD, backbone, precision))
-            odometer = Odometer(bundle, threads=threads, mode=Mode.LIVE)
+            odometer = Odometer(bundle, threads=threads, mode="live")
             calls[f"live {precision}, {threads}"] = live(stack.enter_context(odometer))
         cpu_ms: dict[str, list[float]] = {name: [] for name in calls}
         ages_ms: dict[str, list[float]] = {name: [] for name in calls}
@@ -185,7 +184,7 @@ def neighbour(backbone: str) -> dict[str, Any]:
                 busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", BUSY]))
                 stack.callback(busy.kill)
             calls: dict[str, Callable[[int], object]] = {}
-            for mode in (Mode.LATENCY, Mode.LIVE):
+            for mode in ("latency", "live"):
                 for threads in (THREADS, 1):
                     odometer = Odometer(content, threads=threads, mode=mode)
                     stack.enter_context(odometer)

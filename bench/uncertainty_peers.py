@@ -11,11 +11,9 @@ backbone once stand beside it. Weights are random: they do not change the time. 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +23,7 @@ import torch
 from networks import BACKBONES, WORK, images, open_branches, whole_bundle
 from numpy.typing import NDArray
 from onnx import compose
+from provenance import read_result, result_files
 from rounds import Array, figures, interleaved, just_written, ratio, write_report
 from torch import Tensor, nn
 
@@ -46,7 +45,6 @@ THREADS, ROUNDS, WARM_UP = 2, 30, 3
 PAUSE_S, WARM_CALLS = 0.01, 1
 DROPOUT = 0.1
 NAIVE, SHARED = "naive", "one backbone"
-COMPARISONS = Path(__file__).parent / "results" / "compare"
 
 # One image -> poses (n, 7), in one array or several.
 Call = Callable[[preprocess.Image], Sequence[NDArray[np.float32]]]
@@ -254,8 +252,8 @@ def measured(backbone: str) -> dict[str, Any]:
 def scores() -> dict[str, dict[str, float]]:
     """Median interval score over the seeds, by recording and method, as compared earlier."""
     found: dict[str, dict[str, float]] = {}
-    for path in sorted(COMPARISONS.glob("*.json")):
-        cells = json.loads(path.read_text("utf-8"))["cells"]
+    for path in result_files("compare"):
+        cells = read_result("compare", path.stem)["cells"]
         row = found[path.stem] = {}
         for method in ("cjp", "mc-dropout", "ensemble"):
             for bounds, name in (("own", f"{method}, own bounds"), ("marginal", method)):

@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from bench.provenance import write_result
 from boards.compare import (
     TOLERANCES,
     Difference,
@@ -90,7 +91,6 @@ def main() -> int:
     print_tables(reports)
     if options.json:
         figures = {
-            "command": f"python -m boards {board.name} --frames-per-flight {per_flight}",
             "emulated": {
                 "processor": f"{board.meaning} ({board.cpu})",
                 "emulator": emulator_version(board),
@@ -103,8 +103,7 @@ def main() -> int:
             "tolerances": {name: asdict(each) for name, each in TOLERANCES.items()},
             "bundles": reports,
         }
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
+        write_result(options.json, figures)
     failures = [f"{r['name']}: {line}" for r in reports for line in r["failures"]]
     if tests["failed"]:
         failures.insert(0, f"tests: {tests['failed']} failed")

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import onnxruntime
 
-from cvo_edge.bundle.reading import read_bundle
-from cvo_edge.heads import HEADS
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.input import preprocess
 from cvo_edge.input.sources import open_source
 
@@ -25,7 +24,7 @@ def poses(bundle_dir: Path, folder: str, count: int, *, precise: bool) -> list[l
     """Raw outputs ``pose`` (7 numbers each) of the first ``count`` images of a folder."""
     bundle = read_bundle(bundle_dir)
     spec = bundle.calibration.preprocess
-    extra = HEADS[bundle.calibration.method](bundle.calibration).extra_inputs(0)
+    extra = bundle.head.extra_inputs(0)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.add_session_config_entry("session.x64quantprecision", str(int(precise)))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cvo_edge.bundle.format import Calibration
-    from cvo_edge.bundle.reading import Bundle, read_bundle
+    from cvo_edge.engine.loading import Bundle, read_bundle
     from cvo_edge.engine.model_cache import ModelCache
     from cvo_edge.errors import (
         BundleMismatchError,
@@ -64,7 +64,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Bundle": "bundle.reading",
+    "Bundle": "engine.loading",
     "BundleMismatchError": "errors",
     "Calibration": "bundle.format",
     "CalibrationFileError": "errors",
@@ -86,7 +86,7 @@ _HOMES = {
     "Status": "estimate",
     "UsageError": "errors",
     "open_source": "input.sources",
-    "read_bundle": "bundle.reading",
+    "read_bundle": "engine.loading",
     "read_records": "output.records",
 }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 Scope = Literal["marginal", "joint"]
+SCOPES: tuple[Scope, ...] = get_args(Scope)
 Bands = tuple[tuple[tuple[float, float], ...], ...]
 
 

@@ -15,7 +15,8 @@ import onnx
 import onnxruntime
 
 from cvo_edge.bundle.format import CALIBRATION_FILE, MODEL_FILE
-from cvo_edge.bundle.reading import read_bundle, read_calibration
+from cvo_edge.bundle.reading import read_calibration
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, ModelError
 from cvo_edge.input.preprocess import model_input, selftest_image
 from fuzz.mutate import Generator, changed_bytes, changed_document, with_digest

@@ -12,8 +12,9 @@ import msgspec
 import pytest
 from hypothesis import settings
 
-from cvo_edge.bundle.format import CALIBRATION_FILE, Calibration, Threshold
-from cvo_edge.bundle.reading import Bundle, encode_calibration, read_bundle
+from cvo_edge.bundle.format import CALIBRATION_FILE, Calibration, Joint, Threshold
+from cvo_edge.bundle.reading import encode_calibration
+from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.sets import Scope
 
@@ -82,18 +83,13 @@ def make_head(bundle: Bundle) -> Callable[..., Head]:
         q_hat: Any = (None,) * 6,
         q_hat_upper: Any = None,
         scope: Scope = "marginal",
-        joint: str = "max",
+        joint: Joint = "max",
     ) -> Head:
         entry = Threshold(confidence=0.9, scope=scope, q_hat=q_hat, q_hat_upper=q_hat_upper)
-        source = msgspec.structs.replace(bundle.calibration.calibration, score=score, joint=joint)
-        calibration: Calibration = msgspec.structs.replace(
-            bundle.calibration,
-            method=method,
-            method_parameters=parameters,
-            thresholds=(entry,),
-            calibration=source,
-        )
-        return HEADS[method](calibration)
+        calibration = msgspec.structs.replace(bundle.calibration, method_parameters=parameters)
+        head = HEADS[method](calibration.parameters(HEADS[method].parameters_type), score)
+        head.check((entry,), joint)
+        return head
 
     return make
 

@@ -15,6 +15,8 @@ from cvo_edge.sets import Scope
 
 CALIBRATION_FILE = "calibration.json"
 MODEL_FILE: Literal["model.onnx"] = "model.onnx"
+# A confidence in single precision, e.g. numpy.float32(0.9), means the stored one.
+_SAME_CONFIDENCE = 1e-7
 # Every bundle stores at least these, for both scopes.
 CONFIDENCES = (0.5, 0.8, 0.9, 0.95, 0.99)
 
@@ -36,7 +38,8 @@ SixOrUnbounded = tuple[
 Dtype = Literal["uint8", "float32"]
 Precision = Literal["fp32", "int8"]
 Provider = Literal["onnxruntime", "openvino"]
-MethodName = Literal["cqr", "csp", "mcqr", "cjp"]
+Rule = Literal["pooled", "hierarchical"]
+Joint = Literal["max", "bonferroni"]
 Quaternion = tuple[Number, Number, Number, Number]
 Parameters = TypeVar("Parameters", bound=Struct)
 
@@ -144,8 +147,8 @@ class CalibrationSpec(_Strict, frozen=True):
     """
 
     score: Text
-    joint: Literal["max", "bonferroni"]
-    rule: Literal["pooled", "hierarchical", "weighted"]
+    joint: Joint
+    rule: Rule
     n: Annotated[int, Meta(ge=1, le=10**9)]
     n_sequences: Annotated[int, Meta(ge=1, le=10**9)]
     n_effective: Positive
@@ -184,7 +187,7 @@ class Calibration(_Strict, frozen=True):
 
     schema_version: Literal[1]
     name: Text
-    method: MethodName
+    method: Text
     model: ModelSpec
     preprocess: PreprocessSpec
     pose: PoseSpec
@@ -198,7 +201,9 @@ class Calibration(_Strict, frozen=True):
     def threshold(self, confidence: float, scope: Scope) -> Threshold | None:
         """Return the stored threshold for this confidence and scope, or None."""
         for entry in self.thresholds:
-            if entry.scope == scope and math.isclose(entry.confidence, confidence, abs_tol=1e-9):
+            if entry.scope == scope and math.isclose(
+                entry.confidence, confidence, abs_tol=_SAME_CONFIDENCE
+            ):
                 return entry
         return None
 

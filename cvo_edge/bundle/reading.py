@@ -11,7 +11,6 @@ import math
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,46 +22,31 @@ from cvo_edge.errors import BundleMismatchError, CalibrationFileError, ModelErro
 from cvo_edge.files import read_regular_file, regular_file
 
 SCHEMA_VERSION = 1
+# Stands for the digest of a calibration that has not been written.
+UNWRITTEN = "0" * 64
 MAX_CALIBRATION_BYTES = 64 * 1024
 MAX_MODEL_BYTES = 1 << 30
 MAX_DEPTH = 16
 
 
-@dataclass(frozen=True)
-class Bundle:
-    """A bundle in memory: the calibration and the very bytes whose sha256 it names."""
-
-    calibration: Calibration
-    model_bytes: bytes
-
-
-# What else may speak against a bundle: its folder, its calibration, the bytes it was read from.
+# What else must hold for a bundle, of its folder, its calibration and the bytes it was read from.
 Check = Callable[[Path, Calibration, bytes], None]
 
 
-def read_bundle(folder: Path, check: Check | None = None) -> Bundle:
-    """Read and check a bundle folder; the model's bytes are read once and match their digest.
+def read_model(folder: Path, calibration: Calibration) -> bytes:
+    """Read ``model.onnx`` once; returns the very bytes whose digest matches the calibration's.
 
-    With a ``check``, e.g. of a signature, that as well.
-
-    Raises
-    ------
-    CalibrationFileError
-        ``calibration.json`` is missing, no regular file, malformed or altered.
-    ModelError
-        ``model.onnx`` is missing, no regular file or too large.
-    BundleMismatchError
-        The model is not the one that was calibrated; and what the check raises.
+    Raises ModelError where the file is missing, not a regular one or too large, and
+    BundleMismatchError where it is not the calibrated model.
     """
-    calibration = read_calibration(folder, check)
     path = folder / MODEL_FILE
-    model_bytes = read_regular_file(path, MAX_MODEL_BYTES, ModelError)
-    _check_model_digest(path, hashlib.sha256(model_bytes).hexdigest(), calibration)
-    return Bundle(calibration, model_bytes)
+    model = read_regular_file(path, MAX_MODEL_BYTES, ModelError)
+    _check_model_digest(path, hashlib.sha256(model).hexdigest(), calibration)
+    return model
 
 
 def check_model_file(folder: Path, calibration: Calibration) -> None:
-    """Raise as ``read_bundle`` where a model file is not the calibrated one, keeping none of it."""
+    """Raise as ``read_model`` where a model file is not the calibrated one, keeping none of it."""
     path = folder / MODEL_FILE
     with regular_file(path, MAX_MODEL_BYTES, ModelError) as stream:
         try:
@@ -80,20 +64,19 @@ def _check_model_digest(path: Path, found: str, calibration: Calibration) -> Non
         )
 
 
-def read_calibration(folder: Path, check: Check | None = None) -> Calibration:
-    """Read and check ``calibration.json`` of a bundle folder.
+def read_calibration(folder: str | os.PathLike[str]) -> Calibration:
+    """Read and check ``calibration.json`` of a bundle folder; raises CalibrationFileError."""
+    return read_calibration_file(folder)[0]
 
-    Raises CalibrationFileError, and what a ``check`` raises.
-    """
-    # Not is_dir(): a name that is too long is none, either.
+
+def read_calibration_file(folder: str | os.PathLike[str]) -> tuple[Calibration, bytes]:
+    """Return also the file's bytes, for a signature; else as ``read_calibration``."""
+    # Not is_dir(): it raises for a name that is too long.
     if not os.path.isdir(folder):  # noqa: PTH112
         raise CalibrationFileError(f"{folder}: expected a bundle folder, found none")
-    path = folder / CALIBRATION_FILE
+    path = Path(folder) / CALIBRATION_FILE
     content = read_regular_file(path, MAX_CALIBRATION_BYTES, CalibrationFileError)
-    calibration = decode_calibration(content, str(path))
-    if check is not None:
-        check(folder, calibration, content)
-    return calibration
+    return decode_calibration(content, str(path)), content
 
 
 def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibration:
@@ -199,7 +182,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
     What was written is read back before it is returned, so that nothing the reader would refuse
     is ever written. Raises CalibrationFileError.
     """
-    blank = msgspec.structs.replace(calibration, digest="0" * 64)
+    blank = msgspec.structs.replace(calibration, digest=UNWRITTEN)
     text = json.dumps(msgspec.to_builtins(blank), indent=1, ensure_ascii=False, allow_nan=False)
     # One line a list of numbers: the file is read by people, too.
     text = re.sub(r"\[\s+([^\[\]{}\"]*?)\s+\]", _joined, text) + "\n"
@@ -232,7 +215,7 @@ def _digest_span(content: bytes) -> tuple[int, int]:
 
 def _check_digest(content: bytes) -> None:
     start, stop = _digest_span(content)
-    blank = content[:start] + b"0" * 64 + content[stop:]
+    blank = content[:start] + UNWRITTEN.encode() + content[stop:]
     expected = hashlib.sha256(blank).hexdigest()
     found = content[start:stop].decode("ascii")
     if found != expected:

@@ -1,90 +1,156 @@
-"""A bundle folder -> the bundle, with its model as a cache has it prepared for this machine."""
+"""A bundle folder -> a checked bundle, and the engine that runs its model."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from cvo_edge.bundle.format import MODEL_FILE, Calibration, ModelSpec, TensorSpec
-from cvo_edge.bundle.reading import Bundle, Check, check_model_file, read_bundle, read_calibration
-from cvo_edge.engine.model_cache import ModelCache, Prepared, identity
+from cvo_edge.bundle.reading import Check, check_model_file, read_calibration_file, read_model
+from cvo_edge.engine.model_cache import ModelCache, PreparedModel, identity
 from cvo_edge.engine.session import Session
-from cvo_edge.errors import BundleMismatchError, ModelError
+from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
+from cvo_edge.heads import Head
+from cvo_edge.heads.checked import checked_head
 from cvo_edge.input import preprocess
 
 
-@dataclass(frozen=True)
-class PreparedBundle:
-    """A bundle whose model comes from a cache: the calibration, and what was made of its model."""
+@dataclass(frozen=True, eq=False, repr=False)
+class Bundle:
+    """A checked bundle, ready to run.
+
+    Attributes
+    ----------
+    calibration
+        What ``calibration.json`` says.
+    head
+        The method's score and set, made from it.
+    model
+        The bytes whose sha256 the calibration names, or the form of that model that a cache has
+        prepared for this machine.
+    """
 
     calibration: Calibration
-    prepared: Prepared
+    head: Head
+    model: bytes | PreparedModel
+
+    @classmethod
+    def of(cls, calibration: Calibration, model: bytes | PreparedModel) -> Bundle:
+        """Check a calibration against its method; raises as ``read_bundle``."""
+        return cls(calibration, checked_head(calibration), model)
+
+    @property
+    def model_bytes(self) -> bytes:
+        """The model itself; raises UsageError where the bundle holds a prepared form of it."""
+        if isinstance(self.model, PreparedModel):
+            raise UsageError("bundle: expected one read without a cache, found a prepared model")
+        return self.model
+
+    def __repr__(self) -> str:
+        spec, calibration = self.calibration.model, self.calibration
+        return (
+            f"<Bundle {calibration.name}: {calibration.method}, {spec.precision} on "
+            f"{spec.provider}, sha256 {spec.sha256[:12]}...>"
+        )
 
 
-def load_bundle(
-    folder: Path, cache: ModelCache, check: Check | None = None
-) -> Bundle | PreparedBundle:
-    """Read and check a bundle folder; its model as the cache has it, or puts it there now.
+def read_bundle(
+    folder: str | os.PathLike[str],
+    *,
+    cache: ModelCache | None = None,
+    check: Check | None = None,
+) -> Bundle:
+    """Read and check a bundle folder.
 
-    The bundle as it is where the cache cannot be used, or its model is of another provider. Errors
-    are those of ``read_bundle``: a model file that is not the calibrated one is refused, whatever
-    the cache holds. The digest of one that has not changed since it was last taken, as the system
-    has it, is not taken again.
+    Parameters
+    ----------
+    folder
+        With ``model.onnx`` and ``calibration.json``.
+    cache
+        Takes the model from this cache, prepared for this machine, and puts it there the first
+        time. The bundle holds the model's bytes where the cache cannot be used, and for a provider
+        other than onnxruntime.
+    check
+        What else must hold, e.g. a signature; called before the model is read.
+
+    Raises
+    ------
+    CalibrationFileError
+        ``calibration.json`` is missing, not a regular file, malformed or altered.
+    ModelError
+        ``model.onnx`` is missing, not a regular file or too large.
+    BundleMismatchError
+        The model is not the one that was calibrated, whatever the cache holds, or its tensors are
+        not those of the method; and what ``check`` raises.
     """
-    calibration = read_calibration(folder, check)
-    found = found_in(cache, calibration)
-    if found is not None:
-        model = folder / MODEL_FILE
-        # What runs is the entry, whose files were checked: this is for whoever swaps the model.
-        if not cache.knows(found.prepared, model):
-            before = identity(model)
-            check_model_file(folder, calibration)
-            cache.remember(found.prepared, model, before)
-        return found
-    bundle = read_bundle(folder, check)
-    if calibration.model.provider != "onnxruntime":
-        return bundle
-    prepared = _prepared_now(bundle, cache)
-    return bundle if prepared is None else PreparedBundle(bundle.calibration, prepared)
+    path = Path(folder)
+    calibration, content = read_calibration_file(path)
+    head = checked_head(calibration)
+    if check is not None:
+        check(path, calibration, content)
+    prepared = None if cache is None else prepared_model(cache, calibration)
+    if cache is not None and prepared is not None:
+        _check_original(path, calibration, cache, prepared)
+        return Bundle(calibration, head, prepared)
+    model = read_model(path, calibration)
+    if cache is not None and calibration.model.provider == "onnxruntime":
+        prepared = _prepared_now(calibration, model, cache)
+    return Bundle(calibration, head, model if prepared is None else prepared)
 
 
-def found_in(cache: ModelCache, calibration: Calibration) -> PreparedBundle | None:
-    """Return what the cache has of a calibration's model; of onnxruntime's alone it has any."""
+def prepared_model(cache: ModelCache, calibration: Calibration) -> PreparedModel | None:
+    """Return what the cache has of a calibration's model; only models of onnxruntime are cached."""
     if calibration.model.provider != "onnxruntime":
         return None
-    prepared = cache.find(calibration.model.sha256)
-    return None if prepared is None else PreparedBundle(calibration, prepared)
+    return cache.find(calibration.model.sha256)
 
 
-def _prepared_now(bundle: Bundle, cache: ModelCache) -> Prepared | None:
-    """Build the entry; None where it cannot be kept, or does not compute the very same."""
+def _check_original(
+    folder: Path, calibration: Calibration, cache: ModelCache, prepared: PreparedModel
+) -> None:
+    """Raise BundleMismatchError where the bundle's own model file is not the calibrated one.
+
+    What runs is the cache's entry, whose files were checked: this tells of a model that was
+    swapped. A file that has not changed since its digest was last taken is not read again.
+    """
+    model = folder / MODEL_FILE
+    if not cache.knows(prepared, model):
+        before = identity(model)
+        check_model_file(folder, calibration)
+        cache.remember(prepared, model, before)
+
+
+def _prepared_now(
+    calibration: Calibration, model: bytes, cache: ModelCache
+) -> PreparedModel | None:
+    """Build the entry; None where it cannot be kept or does not compute exactly the same."""
     new = cache.new_folder()
     if new is None:
         return None
-    model = bundle.calibration.model
+    spec = calibration.model
     try:
-        plain = Session(bundle.model_bytes, 1, model, keep_in=new)
-        expected = plain.run(_feeds(model.inputs))
+        plain = Session(model, 1, spec, keep_in=new)
+        expected = plain.run(_feeds(spec.inputs))
     except (ModelError, BundleMismatchError):
-        # The disk may be full. A model that is itself refused says so when it is loaded without.
+        # The disk may be full. A model that is itself refused is refused again without the cache.
         cache.discard(new)
         return None
     # Two models in memory at once would be the peak of the whole run.
     del plain
-    cache.keep(new, bundle.calibration.name, model.sha256)
-    prepared = cache.find(model.sha256)
-    if prepared is not None and not _same(prepared, bundle, expected):
-        cache.forget(model.sha256)
+    cache.keep(new, calibration.name, spec.sha256)
+    prepared = cache.find(spec.sha256)
+    if prepared is not None and not _same(prepared, spec, expected):
+        cache.forget(spec.sha256)
         return None
     return prepared
 
 
-def _same(prepared: Prepared, bundle: Bundle, expected: dict[str, np.ndarray]) -> bool:
-    model = bundle.calibration.model
+def _same(prepared: PreparedModel, spec: ModelSpec, expected: dict[str, np.ndarray]) -> bool:
     try:
-        found = Session(prepared, 1, model).run(_feeds(model.inputs))
+        found = Session(prepared, 1, spec).run(_feeds(spec.inputs))
     except (ModelError, BundleMismatchError):
         return False
     return all(np.array_equal(found[name], values) for name, values in expected.items())
@@ -101,8 +167,8 @@ def _feeds(inputs: tuple[TensorSpec, ...]) -> dict[str, np.ndarray]:
 
 
 def open_session(
-    model: bytes | Prepared,
-    threads: int,
+    model: bytes | PreparedModel,
+    threads: int | None,
     expected: ModelSpec,
     *,
     spinning: bool = True,
@@ -111,17 +177,17 @@ def open_session(
     """Open a session of the provider that a calibration is about.
 
     ``at_once`` is the number of threads that will call it at the same time; the rest as in
-    ``Session``. Raises BundleMismatchError where what a cache has is not of this very model.
+    ``Session``. Raises BundleMismatchError for a prepared model that was made of another model.
     """
-    if isinstance(model, Prepared) and (model.model_sha256, "onnxruntime") != (
+    if isinstance(model, PreparedModel) and (model.model_sha256, "onnxruntime") != (
         expected.sha256,
         expected.provider,
     ):
         raise BundleMismatchError(
-            f"prepared model: expected that of {expected.sha256} on {expected.provider}, found "
-            f"that of {model.model_sha256} on onnxruntime"
+            f"prepared model: expected one of {expected.sha256} on {expected.provider}, found one "
+            f"of {model.model_sha256} on onnxruntime"
         )
-    if expected.provider == "openvino" and not isinstance(model, Prepared):
+    if expected.provider == "openvino" and not isinstance(model, PreparedModel):
         # An optional package, and not a small one.
         from cvo_edge.engine.openvino import OpenvinoSession
 

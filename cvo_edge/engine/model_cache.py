@@ -1,4 +1,4 @@
-"""Prepared models: what onnxruntime makes of a model on this machine, built once and kept.
+"""PreparedModel models: what onnxruntime makes of a model on this machine, built once and kept.
 
 Loading a model means parsing it, rewriting its graph for this processor and laying out its weights
 anew. The result is kept as a folder of two files: the rewritten graph, and its weights, which the
@@ -74,7 +74,7 @@ class FileIdentity(Struct, frozen=True, array_like=True):
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedModel:
     """An entry whose bytes were checked: the graph itself, and the folder with its weights."""
 
     folder: Path
@@ -112,7 +112,7 @@ class ModelCache:
         """
         return cls(own_folder(CACHE_VARIABLE, "XDG_CACHE_HOME", "~/.cache"))
 
-    def find(self, model_sha256: str) -> Prepared | None:
+    def find(self, model_sha256: str) -> PreparedModel | None:
         """Return the entry of a model if this machine has one and its bytes are unchanged.
 
         A changed one is removed.
@@ -136,15 +136,15 @@ class ModelCache:
                 return None
             unchanged = False
         if unchanged:
-            return Prepared(folder, graph, model_sha256)
+            return PreparedModel(folder, graph, model_sha256)
         self.forget(model_sha256)
         return None
 
-    def knows(self, prepared: Prepared, model: Path) -> bool:
+    def knows(self, prepared: PreparedModel, model: Path) -> bool:
         """Whether this very model file has had its digest taken, and has not changed since."""
         return identity(model) in _seen(prepared)
 
-    def remember(self, prepared: Prepared, model: Path, before: FileIdentity | None) -> None:
+    def remember(self, prepared: PreparedModel, model: Path, before: FileIdentity | None) -> None:
         """Note a model file whose digest was right; ``before`` is what it was before that."""
         if before is None or before != identity(model):
             return
@@ -294,7 +294,7 @@ def identity(path: Path) -> FileIdentity | None:
     )
 
 
-def _seen(prepared: Prepared) -> list[FileIdentity]:
+def _seen(prepared: PreparedModel) -> list[FileIdentity]:
     try:
         return msgspec.json.decode(_content(prepared.folder / SEEN_FILE), type=list[FileIdentity])
     except (OSError, *_UNDECODABLE):

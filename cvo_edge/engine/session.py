@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Dtype, ModelSpec, TensorSpec
 from cvo_edge.cores import checked_threads, cores_of_threads
-from cvo_edge.engine.model_cache import GRAPH_FILE, WEIGHTS_FILE, Prepared
+from cvo_edge.engine.model_cache import GRAPH_FILE, WEIGHTS_FILE, PreparedModel
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 
 # No word of it leaves this machine.
@@ -124,7 +124,7 @@ class Session:
 
     def __init__(
         self,
-        model: bytes | Prepared,
+        model: bytes | PreparedModel,
         threads: int | None = None,
         expected: ModelSpec | None = None,
         *,
@@ -154,7 +154,7 @@ class Session:
             prefix = "session.optimized_model_external_initializers_"
             options.add_session_config_entry(prefix + "file_name", WEIGHTS_FILE)
             options.add_session_config_entry(prefix + "min_size_in_bytes", str(_SMALL_TENSOR))
-        if isinstance(model, Prepared):
+        if isinstance(model, PreparedModel):
             content, weights = model.graph, str(model.folder)
             options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         else:

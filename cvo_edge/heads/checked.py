@@ -1,8 +1,8 @@
-"""What ``calibration.json`` says, seen together with its method: rules that no key has alone."""
+"""Building the head of a calibration, and the rules between ``calibration.json`` and its method."""
 
 from __future__ import annotations
 
-from cvo_edge.bundle.format import Calibration, Threshold
+from cvo_edge.bundle.format import Calibration, ModelSpec, Threshold
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError
 from cvo_edge.heads import HEADS, Head
 
@@ -12,8 +12,8 @@ _ROUNDING = 1e-9
 _SIDES = ("q_hat", "q_hat_upper")
 
 
-def consistent_head(calibration: Calibration) -> Head:
-    """Return the head of a calibration, unless its method cannot have given what it says.
+def checked_head(calibration: Calibration) -> Head:
+    """Return the head of a calibration, after checking what the method says about its numbers.
 
     Raises
     ------
@@ -27,15 +27,18 @@ def consistent_head(calibration: Calibration) -> Head:
         raise CalibrationFileError(
             f"method: expected one of {', '.join(HEADS)}, found {calibration.method}"
         )
-    head = HEADS[calibration.method](calibration)
-    _check_tensors(calibration, head)
+    kind = HEADS[calibration.method]
+    source = calibration.calibration
+    head = kind(calibration.parameters(kind.parameters_type), source.score)
+    head.check(calibration.thresholds, source.joint)
+    check_tensors(calibration.model, head)
     if not head.one_joint_score:
         _check_joint(calibration.thresholds, head)
     return head
 
 
-def _check_tensors(calibration: Calibration, head: Head) -> None:
-    model = calibration.model
+def check_tensors(model: ModelSpec, head: Head) -> None:
+    """Raise BundleMismatchError where a model has other inputs or outputs than its method."""
     # The image alone is of bytes, as was checked.
     image = {spec.name: (spec.dtype, spec.shape) for spec in model.inputs if spec.name == "image"}
     extra = {name: ("float32", noise.shape) for name, noise in head.extra_inputs(0).items()}
@@ -47,7 +50,7 @@ def _check_tensors(calibration: Calibration, head: Head) -> None:
         found = {spec.name: (spec.dtype, spec.shape) for spec in specs}
         if found != needed:
             raise BundleMismatchError(
-                f"model.{kind}: expected {needed} for method {calibration.method}, found {found}"
+                f"model.{kind}: expected {needed} for method {head.method}, found {found}"
             )
 
 

@@ -7,13 +7,13 @@ The network's bounds carry no guarantee of their own. Conformalized quantile reg
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration, SixPositive
+from cvo_edge.bundle.format import SixPositive
 from cvo_edge.heads.cqr import CqrHead
 
 
@@ -35,12 +35,10 @@ class CjpParameters(Struct, frozen=True, forbid_unknown_fields=True):
 class CjpHead(CqrHead):
     """Score and set of conformalized joint prediction: those of CQR on the network's bounds."""
 
-    parameters_type: ClassVar[type[Struct]] = CjpParameters
-
-    def __init__(self, calibration: Calibration) -> None:
-        self.parameters = calibration.parameters(CjpParameters)
-        floor = self.parameters.half_width_floor
-        self._prepare(calibration, floor, "symmetric", ("additive", "normalised"))
+    method = "cjp"
+    parameters_type = CjpParameters
+    score_names = ("additive", "normalised")
+    parameters: CjpParameters
 
     def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
         """Latent noise (1, latent_size) in ``sample`` mode, nothing otherwise."""

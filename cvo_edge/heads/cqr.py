@@ -19,7 +19,7 @@ outside, and its inverse moves the bounds by the conformal quantile q. Three sco
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar, Literal
@@ -28,9 +28,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration, SixOrUnbounded, SixPositive, Threshold
-from cvo_edge.conformal import JointScale, LinearScale
+from cvo_edge.bundle.format import Joint, SixOrUnbounded, SixPositive, Threshold
 from cvo_edge.errors import CalibrationFileError
+from cvo_edge.heads.base import Candidate, Head
 from cvo_edge.sets import ConformalSet, Scope
 
 Array = NDArray[np.float64]
@@ -88,56 +88,41 @@ class CqrParameters(Struct, frozen=True, forbid_unknown_fields=True):
     sides: Sides
 
 
-class CqrHead:
+class CqrHead(Head):
     """Score and set of conformalized quantile regression."""
 
+    method = "cqr"
     parameters_type: ClassVar[type[Struct]] = CqrParameters
-    one_joint_score: ClassVar[bool] = False
+    score_names: ClassVar[tuple[str, ...]] = ("additive", "normalised", "residual")
 
-    def __init__(self, calibration: Calibration) -> None:
-        parameters = calibration.parameters(CqrParameters)
-        self._prepare(
-            calibration,
-            parameters.half_width_floor,
-            parameters.sides,
-            ("additive", "normalised", "residual"),
-        )
-
-    def _prepare(
-        self, calibration: Calibration, floor: SixPositive, sides: Sides, known: tuple[str, ...]
-    ) -> None:
-        """Take one of the known scores and check the thresholds against it."""
-        score = calibration.calibration.score
-        if score not in known:
-            raise CalibrationFileError(
-                f"calibration.score: expected one of {', '.join(known)} for {calibration.method}, "
-                f"found {score!r}"
-            )
-        self._score = IntervalScore(np.array(floor) if score == "normalised" else None)
-        self._sides = sides
+    def __init__(self, parameters: Any, score: str) -> None:  # noqa: ANN401 - as ``Head``
+        super().__init__(parameters, score)
+        # CJP has no such parameter: its network gives both bounds.
+        self._sides: Sides = getattr(parameters, "sides", "symmetric")
+        floor = np.array(parameters.half_width_floor)
+        self._score = IntervalScore(floor if score == "normalised" else None)
         self._bounds = score != "residual"
-        self.outputs: Mapping[str, tuple[int, ...]] = _BOUNDED if self._bounds else _POINT
-        symmetric = sides == "symmetric"
-        if any((t.q_hat_upper is None) != symmetric for t in calibration.thresholds):
+        self.outputs = _BOUNDED if self._bounds else _POINT
+
+    def check(self, thresholds: Sequence[Threshold], joint: Joint) -> None:
+        """As ``Head``: one threshold a side, and factors that are not negative."""
+        symmetric = self._sides == "symmetric"
+        if any((entry.q_hat_upper is None) != symmetric for entry in thresholds):
             raise CalibrationFileError(
                 f"thresholds.q_hat_upper: expected {'null' if symmetric else 'six values'} with "
-                f"{sides} sides, found otherwise"
+                f"{self._sides} sides, found otherwise"
             )
         for number, level in enumerate(self.side_confidences(0.9)):
             side = "q_hat_upper" if number else "q_hat"
             if level is None and any(
-                q is not None for t in calibration.thresholds for q in getattr(t, side) or ()
+                q is not None for entry in thresholds for q in getattr(entry, side) or ()
             ):
                 raise CalibrationFileError(
-                    f"thresholds.{side}: expected null with {sides} sides, found numbers"
+                    f"thresholds.{side}: expected null with {self._sides} sides, found numbers"
                 )
-        if symmetric and score != "additive":
-            for entry in calibration.thresholds:
-                refuse_negative(entry, score)
-
-    def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
-        """Nothing: the image is the only input."""
-        return {}
+        if symmetric and self.score != "additive":
+            for entry in thresholds:
+                refuse_negative(entry, self.score)
 
     def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
         """The marginal confidence of each side's threshold, None where a side has none."""
@@ -147,10 +132,6 @@ class CqrHead:
             "lower": (confidence, None),
             "upper": (None, confidence),
         }[self._sides]
-
-    def joint_scale(self, scores: Array) -> JointScale:
-        """Scores (n, sides, 6) of other frames -> how columns are compared for the joint scope."""
-        return LinearScale.fitted(scores)
 
     def scores(
         self,
@@ -173,6 +154,22 @@ class CqrHead:
         if threshold.q_hat_upper is not None:
             q_high = infinite_where_null(threshold.q_hat_upper)
         return self._score.inverse(lower.reshape(6), upper.reshape(6), point, q_low, q_high)
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """As ``Head``; a network without bounds has the residual score alone."""
+        names = (self.score,) if not self._bounds else (self.score, "normalised", "additive")
+        return tuple(Candidate(name, self.parameters) for name in dict.fromkeys(names))
+
+    def own_sets(self, outputs: Mapping[str, NDArray[Any]], point: Array) -> list[ConformalSet]:
+        """As ``Head``: the set of the additive score at the threshold zero."""
+        if not self._bounds:
+            return []
+        rows = zip(*self._interval(outputs, point), point, strict=True)
+        return [IntervalScore(None).inverse(*row, np.zeros(6), np.zeros(6)) for row in rows]
+
+    def description(self) -> str:
+        """As ``Head``: which bounds are calibrated."""
+        return str(getattr(self.parameters, "sides", ""))
 
     def _interval(self, outputs: Mapping[str, NDArray[Any]], point: Array) -> tuple[Array, Array]:
         if not self._bounds:

@@ -16,32 +16,28 @@ in calibration as in use, so that coverage counts it and sets end where the work
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from enum import StrEnum
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration, Number, Threshold
+from cvo_edge.bundle.format import Number, Threshold
 from cvo_edge.conformal import JointScale, RankScale
 from cvo_edge.errors import CalibrationFileError
+from cvo_edge.heads.base import Candidate, Head
 from cvo_edge.heads.cqr import infinite_where_null
 from cvo_edge.sets import ConformalSet, Scope
 
 Array = NDArray[np.float64]
+Score = Literal["lac", "aps", "raps"]
 _SIX = np.arange(6)
+# Of the raps score, for a bundle that has no penalty of its own.
+_PENALTY, _FREE_RANKS = 0.01, 5
 Edges = Annotated[tuple[Number, ...], Meta(min_length=3, max_length=513)]
-
-
-class Score(StrEnum):
-    """Nonconformity scores of classes, see above."""
-
-    LAC = "lac"
-    APS = "aps"
-    RAPS = "raps"
 
 
 class CspParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -57,24 +53,19 @@ class CspParameters(Struct, frozen=True, forbid_unknown_fields=True):
     free_ranks: Annotated[int, Meta(ge=0, le=512)]
 
 
-class CspHead:
+class CspHead(Head):
     """Score and set of conformalized set prediction."""
 
-    parameters_type: ClassVar[type[Struct]] = CspParameters
-    one_joint_score: ClassVar[bool] = False
+    method = "csp"
+    parameters_type = CspParameters
+    score_names = get_args(Score)
+    infinite_score = "too many calibration truths lie outside the workspace of the classes"
+    parameters: CspParameters
 
-    def __init__(self, calibration: Calibration) -> None:
-        self.parameters = calibration.parameters(CspParameters)
-        try:
-            self._score = Score(calibration.calibration.score)
-        except ValueError:
-            raise CalibrationFileError(
-                f"calibration.score: expected one of {', '.join(Score)} for csp, "
-                f"found {calibration.calibration.score!r}"
-            ) from None
-        if any(t.q_hat_upper is not None for t in calibration.thresholds):
-            raise CalibrationFileError("thresholds.q_hat_upper: expected null for csp, found more")
-        edges = self.parameters.edges
+    def __init__(self, parameters: CspParameters, score: Score) -> None:
+        super().__init__(parameters, score)
+        self._score: Score = score
+        edges = parameters.edges
         for dof, row in enumerate(edges):
             if any(not low < high for low, high in pairwise(row)):
                 raise CalibrationFileError(
@@ -82,25 +73,17 @@ class CspHead:
                 )
         self._classes = np.array([len(row) - 1 for row in edges])
         most = int(self._classes.max())
-        self.outputs: Mapping[str, tuple[int, ...]] = {
+        self.outputs = {
             "pose": (1, 7),
             "probabilities": (1, 6, most),
         }
         self._edges = np.array([(*row, *(row[-1],) * (most + 1 - len(row))) for row in edges])
         self._unused = np.arange(most) >= self._classes[:, None]
 
-    def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
-        """Nothing: the image is the only input."""
-        return {}
-
-    def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
-        """One threshold for the whole set."""
-        return (confidence,)
-
     def joint_scale(self, scores: Array) -> JointScale:
         """Scores (n, 1, 6) of other frames -> how DoFs are compared for the joint scope."""
         top = 1.0
-        if self._score is Score.RAPS:
+        if self._score == "raps":
             ranks = int(self._classes.max()) - self.parameters.free_ranks
             top += self.parameters.penalty * max(0, ranks)
         return RankScale.fitted(scores, top)
@@ -152,6 +135,29 @@ class CspHead:
             bands=(*map(tuple, bands),),
         )
 
+    def candidates(self) -> tuple[Candidate, ...]:
+        """As ``Head``; the raps score needs a penalty, where the bundle has none of its own."""
+        plain = penalised = self.parameters
+        if plain.penalty == 0.0:
+            penalised = replace(plain, penalty=_PENALTY, free_ranks=_FREE_RANKS)
+        family = {"aps": plain, "lac": plain, "raps": penalised}
+        own = {self.score: plain}
+        return tuple(Candidate(name, of) for name, of in (own | family | own).items())
+
+    def figures(self, sets: Sequence[ConformalSet]) -> dict[str, Any]:
+        """As ``Head``: ``set_size``, the mean number of classes in a set of each DoF, (6,)."""
+        return {"set_size": np.mean([self.classes_in(each) for each in sets], axis=0).tolist()}
+
+    @classmethod
+    def figures_text(cls, figures: Mapping[str, Any]) -> str:
+        """As ``Head``."""
+        return f"classes in a set {np.mean(figures['set_size']):.1f}"
+
+    def description(self) -> str:
+        """As ``Head``: how many classes a degree of freedom has."""
+        counts = [len(row) - 1 for row in self.parameters.edges]
+        return f"{min(counts)} to {max(counts)} classes per degree of freedom"
+
     def classes_in(self, conformal_set: ConformalSet) -> NDArray[np.int64]:
         """Return how many classes of each DoF a set of this head holds, (6,); all if unbounded."""
         counts = []
@@ -174,13 +180,13 @@ def class_scores(
     most the threshold.
     """
     p = probabilities.astype(np.float64)
-    if score is Score.LAC:
+    if score == "lac":
         return np.asarray(1.0 - p)
     # As one long array, where numpy's indexing is several times faster than along an axis.
     rows = np.arange(0, p.size, p.shape[-1]).reshape(*p.shape[:-1], 1)
     order = np.argsort(-p, axis=-1, kind="stable") + rows
     ranked = np.cumsum(p.ravel()[order], axis=-1)
-    if score is Score.RAPS:
+    if score == "raps":
         ranked += penalty * np.maximum(np.arange(1, p.shape[-1] + 1) - free_ranks, 0)
     scores = np.empty(p.size)
     scores[order] = ranked

@@ -19,22 +19,22 @@ or are factors of its half-widths about its middle (``normalised``).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration, SixPositive, Threshold
+from cvo_edge.bundle.format import Joint, SixPositive, Threshold
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
+from cvo_edge.heads.base import Candidate, Head
 from cvo_edge.heads.cqr import IntervalScore, infinite_where_null, refuse_negative
 from cvo_edge.sets import ConformalSet, Ellipsoids, Scope, scaled_distance, unbounded_set
 
 Array = NDArray[np.float64]
 
-_SCORES = ("normalised", "additive")
 _HAIR = 1e-12
 # What of the scale matrix counts; outputs are finite here.
 _LOWER = np.tril(np.ones((6, 6)))
@@ -53,38 +53,37 @@ class McqrParameters(Struct, frozen=True, forbid_unknown_fields=True):
     half_width_floor: SixPositive
 
 
-class McqrHead:
+class McqrHead(Head):
     """Score, region and intervals of multivariate conformalized quantile regression."""
 
-    parameters_type: ClassVar[type[Struct]] = McqrParameters
-    one_joint_score: ClassVar[bool] = True
+    method = "mcqr"
+    parameters_type = McqrParameters
+    score_names = ("normalised", "additive")
+    one_joint_score = True
+    set_kind = "all six at once, a region"
+    parameters: McqrParameters
 
-    def __init__(self, calibration: Calibration) -> None:
-        parameters = calibration.parameters(McqrParameters)
-        score = calibration.calibration.score
-        if score not in _SCORES:
-            raise CalibrationFileError(
-                f"calibration.score: expected one of {', '.join(_SCORES)} for mcqr, found {score!r}"
-            )
-        if calibration.calibration.joint != "max":
-            raise CalibrationFileError(
-                "calibration.joint: expected max for mcqr, which has one score for all six, found "
-                f"{calibration.calibration.joint}"
-            )
-        normalised = score == "normalised"
-        self._score = IntervalScore(np.array(parameters.half_width_floor) if normalised else None)
-        self.outputs: Mapping[str, tuple[int, ...]] = {
+    def __init__(self, parameters: McqrParameters, score: str) -> None:
+        super().__init__(parameters, score)
+        floor = np.array(parameters.half_width_floor)
+        self._score = IntervalScore(floor if score == "normalised" else None)
+        self.outputs = {
             "pose": (1, 7),
             "codebook": (1, parameters.points, 6),
             "scale": (1, 6, 6),
         }
-        for entry in calibration.thresholds:
-            if entry.q_hat_upper is not None:
-                raise CalibrationFileError(
-                    "thresholds.q_hat_upper: expected null for mcqr, found more"
-                )
+
+    def check(self, thresholds: Sequence[Threshold], joint: Joint) -> None:
+        """As ``Head``: one distance for all six in the joint scope."""
+        super().check(thresholds, joint)
+        if joint != "max":
+            raise CalibrationFileError(
+                "calibration.joint: expected max for mcqr, which has one score for all six, found "
+                f"{joint}"
+            )
+        for entry in thresholds:
             radius = entry.q_hat[0]
-            if normalised:
+            if self.score == "normalised":
                 refuse_negative(entry, "mcqr")
             if entry.scope == "joint" and not (
                 entry.q_hat == (radius,) * 6 and (radius is None or radius >= 0.0)
@@ -93,14 +92,6 @@ class McqrHead:
                     "thresholds.q_hat: expected one distance of at least 0, six times, for mcqr "
                     f"and scope joint, found {list(entry.q_hat)} at {entry.confidence}"
                 )
-
-    def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
-        """Nothing: the image is the only input."""
-        return {}
-
-    def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
-        """One threshold for the whole set."""
-        return (confidence,)
 
     def joint_scale(self, scores: Array) -> JointScale:
         """Nothing to compare: six times one distance."""
@@ -153,3 +144,12 @@ class McqrHead:
             return ConformalSet(lowest - reach, highest + reach, ellipsoids=ellipsoids)
         lower, upper = lowest - extent, highest + extent
         return self._score.inverse(lower, upper, 0.5 * (lower + upper), q_hat, q_hat)
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """As ``Head``."""
+        names = dict.fromkeys((self.score, *self.score_names))
+        return tuple(Candidate(name, self.parameters) for name in names)
+
+    def joint_description(self, joint: Joint) -> str:
+        """As ``Head``."""
+        return "distance to the points of a region"

@@ -31,7 +31,7 @@ from cvo_edge.programs.measure import (
     quantiles,
     waited_for_cores_s,
 )
-from cvo_edge.scheduling import AHEAD, Mode
+from cvo_edge.scheduling import AHEAD
 from cvo_edge.sets import Scope
 
 # A common camera's frame, used where no source is given, and its rate.
@@ -65,7 +65,7 @@ def benchmark(
     *,
     frames: int = 200,
     warmup: int = 20,
-    mode: Mode | str = Mode.LATENCY,
+    mode: str = "latency",
     threads: int | None = None,
     confidence: float = 0.9,
     scope: Scope = "marginal",
@@ -101,7 +101,7 @@ def benchmark(
     first = next(iter(stream))
     odometer.step(first.image)
     first_interval_ms = _process_age_ms()
-    measure = _steps if odometer.mode is Mode.LATENCY else _streams
+    measure = _steps if odometer.mode == "latency" else _streams
     found = measure(odometer, session, stream, frames, warmup)
     if not found.latency.count:
         raise SourceError(
@@ -167,7 +167,7 @@ def _streams(
     """A part of the frames as a stream, as many bare calls, and so on."""
     found = _Found()
     feeds = _blank_feeds(odometer)
-    live = odometer.mode is Mode.LIVE
+    live = odometer.mode == "live"
     with closing(odometer.stream(stream)) as estimates:
         for _ in islice(estimates, warmup):
             pass
@@ -232,9 +232,9 @@ def benchmark_lines(report: dict[str, Any]) -> list[str]:
 
 
 _RATIOS = {
-    Mode.LATENCY: "array to interval",
-    Mode.THROUGHPUT: "time a frame",
-    Mode.LIVE: "age of a frame at its interval",
+    "latency": "array to interval",
+    "throughput": "time a frame",
+    "live": "age of a frame at its interval",
 }
 
 

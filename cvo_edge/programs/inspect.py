@@ -9,21 +9,21 @@ import msgspec
 
 from cvo_edge.bundle.format import Calibration, CalibrationSpec
 from cvo_edge.engine.model_cache import ModelCache
-from cvo_edge.heads import HEADS
-from cvo_edge.heads.cqr import CqrParameters
-from cvo_edge.heads.csp import CspParameters
+from cvo_edge.heads import HEADS, Head
+from cvo_edge.heads.checked import checked_head
 from cvo_edge.pose import Chart
 
 
 def inspect_lines(calibration: Calibration) -> list[str]:
-    """Return a bundle's description for a person."""
+    """Return a bundle's description for a person; raises as ``checked_head``."""
     model, source = calibration.model, calibration.calibration
-    pose = calibration.pose
+    pose, head = calibration.pose, checked_head(calibration)
+    details = f", {head.description()}" if head.description() else ""
     tensors = ", ".join(f"{t.name} {list(t.shape)}" for t in (*model.inputs, *model.outputs))
     dof = Chart(pose.rotation).dof
     lines = [
         f"name         {calibration.name}",
-        f"method       {calibration.method}, {source.score} score{_details(calibration)}",
+        f"method       {calibration.method}, {source.score} score{details}",
         f"model        {model.precision}, opset {model.opset}, sha256 {model.sha256[:16]}..., "
         f"on {model.provider}",
         f"tensors      {tensors}",
@@ -31,7 +31,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         f"calibrated   on {source.n} frames of {source.n_sequences} sequence(s) of "
         f"{source.dataset}, split {source.split.kind} (seed {source.split.seed}), {source.rule}"
         + _worth(source),
-        f"joint        by {_joint(calibration)}",
+        f"joint        by {head.joint_description(source.joint)}",
         f"backbone     {calibration.provenance.backbone or 'a given network'}",
         "",
         f"{'q_hat at':<16}" + "".join(f"{name:>11}" for name in dof),
@@ -43,37 +43,12 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         for side, values in sides:
             cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>11}" for v in values)
             lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<16}" + cells)
-    return lines + _unbounded(calibration)
+    return lines + _unbounded(calibration, head)
 
 
-def _details(calibration: Calibration) -> str:
-    """Sides of a method that has some, classes of one that has those.
-
-    Raises CalibrationFileError where the parameters are not the method's.
-    """
-    if calibration.method not in HEADS:
-        return ""
-    parameters = calibration.parameters(HEADS[calibration.method].parameters_type)
-    if isinstance(parameters, CqrParameters):
-        return f", {parameters.sides}"
-    if isinstance(parameters, CspParameters):
-        counts = [len(row) - 1 for row in parameters.edges]
-        return f", {min(counts)} to {max(counts)} classes a degree of freedom"
-    return ""
-
-
-def _joint(calibration: Calibration) -> str:
-    method = calibration.method
-    if method in HEADS and HEADS[method].one_joint_score:
-        return "distance to the points of a region"
-    return calibration.calibration.joint
-
-
-def _unbounded(calibration: Calibration) -> list[str]:
+def _unbounded(calibration: Calibration, head: Head) -> list[str]:
     """Say why thresholds are unbounded: how many frames or sequences they would need."""
-    if calibration.method not in HEADS:
-        return []
-    source, head = calibration.calibration, HEADS[calibration.method](calibration)
+    source = calibration.calibration
     unit, given = ("frames", source.n)
     if source.rule == "hierarchical":
         unit, given = ("sequences", source.n_sequences)
@@ -95,9 +70,7 @@ def _unbounded(calibration: Calibration) -> list[str]:
         needed = math.ceil(level / (1.0 - level) - 1e-9)
         reason = f"needs at least {needed} calibration {unit}, has {given}"
         if given >= needed:
-            reason = "too many calibration truths have an infinite score"
-            if calibration.method == "csp":
-                reason = "too many calibration truths lie outside the workspace of the classes"
+            reason = head.infinite_score
         lines.append(f"unbounded    at {entry.confidence:g} {entry.scope}: {reason}")
     return lines
 
@@ -143,7 +116,9 @@ def calibration_schema() -> dict[str, Any]:
     (document, *own), components = msgspec.json.schema_components(
         [Calibration, *parameters], ref_template="#/$defs/{name}"
     )
-    components["Calibration"]["properties"]["method_parameters"] = {"anyOf": own}
+    properties = components["Calibration"]["properties"]
+    properties["method"] = {"enum": list(HEADS)}
+    properties["method_parameters"] = {"anyOf": own}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **document,

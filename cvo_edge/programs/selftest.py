@@ -6,13 +6,13 @@ import numpy as np
 
 from cvo_edge.errors import GateError
 from cvo_edge.input import preprocess
-from cvo_edge.odometer import Observation, Odometer
+from cvo_edge.observer import Observation, Observer
+from cvo_edge.odometer import Odometer
 
 
-def observe_selftest(odometer: Odometer) -> Observation:
+def observe_selftest(observer: Observer | Odometer, height: int, width: int) -> Observation:
     """Run the recipe's image through preprocessing and network, as frame number 0."""
-    test = odometer.calibration.selftest
-    return odometer.observe(preprocess.selftest_image(test.height, test.width), seq=0)
+    return observer.observe(preprocess.selftest_image(height, width), seq=0)
 
 
 def check_selftest(odometer: Odometer) -> float:
@@ -22,7 +22,7 @@ def check_selftest(odometer: Odometer) -> float:
     something else than what was calibrated, so that no stated probability holds.
     """
     test = odometer.calibration.selftest
-    outputs = observe_selftest(odometer).outputs
+    outputs = observe_selftest(odometer, test.height, test.width).outputs
     worst, worst_name = 0.0, ""
     for name, expected in test.outputs.items():
         # NaN must fail: as the largest difference of all.

@@ -164,9 +164,8 @@ def child() -> None:
 def _selftest(
     folder: str, threads: int | None, timeout_s: float, public_key: str | None
 ) -> Verdict:
-    from cvo_edge.bundle.reading import Bundle, read_bundle
     from cvo_edge.cores import checked_threads
-    from cvo_edge.engine.loading import PreparedBundle, found_in
+    from cvo_edge.engine.loading import Bundle, prepared_model, read_bundle
     from cvo_edge.engine.model_cache import ModelCache
     from cvo_edge.odometer import Odometer
     from cvo_edge.programs.selftest import check_selftest
@@ -176,19 +175,20 @@ def _selftest(
         from cvo_edge.bundle.signature import Trust
 
         check = Trust.in_key(Path(public_key)).check
-    content = read_bundle(Path(folder), check)
-    _limit(len(content.model_bytes), checked_threads(threads), timeout_s)
-    forms: list[Bundle | PreparedBundle] = [content]
-    prepared = found_in(ModelCache.default(), content.calibration)
+    bundle = read_bundle(folder, check=check)
+    calibration = bundle.calibration
+    _limit(len(bundle.model_bytes), checked_threads(threads), timeout_s)
+    forms = [bundle]
+    prepared = prepared_model(ModelCache.default(), calibration)
     if prepared is not None:
-        forms.append(prepared)
-    first, worst = content.calibration.thresholds[0], 0.0
+        forms.append(Bundle(calibration, bundle.head, prepared))
+    first, worst = calibration.thresholds[0], 0.0
     for form in forms:
         with Odometer(
             form, threads=threads, confidence=first.confidence, scope=first.scope
         ) as odometer:
             worst = max(worst, check_selftest(odometer))
-    return Verdict(content.calibration.name, worst, content.calibration.selftest.tolerance)
+    return Verdict(calibration.name, worst, calibration.selftest.tolerance)
 
 
 def _limit(model_bytes: int, threads: int, timeout_s: float) -> None:

@@ -7,38 +7,39 @@ gets thresholds of other data: a new site, another camera, another light.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import (
     Calibration,
-    CalibrationSpec,
+    Joint,
     PoseLimits,
     PoseSpec,
     PreprocessSpec,
     Provenance,
     Provider,
+    Rule,
     TensorSpec,
 )
-from cvo_edge.bundle.reading import read_bundle
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageError
 from cvo_edge.geometry import mean_rotation
-from cvo_edge.heads import HEADS
+from cvo_edge.heads import Candidate
 from cvo_edge.heads.cqr import CqrParameters, Sides
-from cvo_edge.heads.csp import CspParameters
 from cvo_edge.input.preprocess import Crop
 from cvo_export.bundles.draft import (
     CAMERA_FRAME,
     FEW_POSES_MARGIN,
     HALF_WIDTH_FLOOR,
     WORLD_FRAME,
-    blank_selftest,
+    Draft,
     known_coordinates,
     known_space,
     model_spec,
@@ -46,7 +47,7 @@ from cvo_export.bundles.draft import (
     six,
     versions,
 )
-from cvo_export.bundles.thresholds import Candidate, Joint, Rule, calibrated, selected
+from cvo_export.bundles.thresholds import calibrated, selected
 from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.data.splits import Kind, Split, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
@@ -58,11 +59,9 @@ _FORMS = ({"pose": (1, 7)}, {"pose": (1, 7), "lower": (1, 6), "upper": (1, 6)})
 _FULL_TURN = float(np.pi)
 _LEAST_INPUT = 16
 _PACKAGES = ("cvo-edge", "cvo-export", "onnx", "onnxruntime", "numpy")
-# Of the raps score, where a bundle has none of its own.
-_PENALTY, _FREE_RANKS = 0.01, 5
 
 
-def recalibrate(
+def calibrate(
     model: Path,
     dataset: PoseDataset,
     bundle_dir: Path,
@@ -108,11 +107,11 @@ def recalibrate(
             raise UsageError("rotation, crop: expected with an ONNX file, found with a bundle")
         bundle = read_bundle(model)
         split = _split_of(bundle.calibration, dataset, kind, seed, new_data)
-        draft = bundle.calibration
+        draft = Draft.of(bundle.calibration)
         if split.purpose == "calibration":
             draft = _with_wider_limits(draft, dataset.poses[split.roles["val"]])
         model_bytes = bundle.model_bytes
-        candidates = _own_candidates(bundle.calibration)
+        candidates = bundle.head.candidates()
     else:
         model_bytes = _read_model(model)
         split = _new_split(dataset, kind, seed)
@@ -122,17 +121,17 @@ def recalibrate(
         candidates = _given_candidates(draft)
     if rule is None:
         rule = "hierarchical" if split.kind == "sequence" else "pooled"
-    source = replace(
-        draft.calibration, rule=rule, joint=joint, split=split.spec(dataset), dataset=dataset.name
-    )
     own = provider or draft.model.provider
     made = {**draft.provenance.created_with, **versions((*_PACKAGES, own))}
     draft = replace(
         draft,
         name=name,
-        calibration=source,
-        model=replace(draft.model, provider=own),
-        provenance=replace(draft.provenance, created_with=made),
+        rule=rule,
+        joint=joint,
+        split=split.spec(dataset),
+        dataset=dataset.name,
+        model=msgspec.structs.replace(draft.model, provider=own),
+        provenance=msgspec.structs.replace(draft.provenance, created_with=made),
     )
     chosen_from = selected(candidates, score, sides)
     calibration = calibrated(draft, model_bytes, dataset, split.roles, chosen_from)
@@ -197,7 +196,7 @@ def _from_model(
     name: str,
     rotation: GivenRotation,
     crop: Crop,
-) -> Calibration:
+) -> Draft:
     """Draft for a model that nothing is known of but its tensors and the data's poses."""
     spec = model_spec(model_bytes, _opset(model_bytes))
     outputs = {tensor.name: tensor.shape for tensor in spec.outputs}
@@ -219,8 +218,7 @@ def _from_model(
     reference, limits, deviation = known_space(dataset.poses[split.roles["val"]])
     if rotation == "euler_zyx" or reference is None:
         reference, limits = None, _with_any_rotation(limits)
-    return Calibration(
-        schema_version=1,
+    return Draft(
         name=name,
         method="cqr",
         model=spec,
@@ -245,19 +243,6 @@ def _from_model(
             limits=limits,
             standard_deviation=deviation,
         ),
-        thresholds=(),
-        method_parameters={},
-        calibration=CalibrationSpec(
-            score="",
-            joint="max",
-            rule="pooled",
-            n=1,
-            n_sequences=1,
-            n_effective=1.0,
-            split=split.spec(dataset),
-            dataset=dataset.name,
-        ),
-        selftest=blank_selftest(spec.precision),
         provenance=Provenance(
             created_with=versions(_PACKAGES),
             seed=split.seed,
@@ -267,7 +252,10 @@ def _from_model(
             training_split=None,
             options={},
         ),
-        digest="0" * 64,
+        rule="pooled",
+        joint="max",
+        split=split.spec(dataset),
+        dataset=dataset.name,
     )
 
 
@@ -283,9 +271,9 @@ def _with_any_rotation(limits: PoseLimits) -> PoseLimits:
     )
 
 
-def _with_wider_limits(calibration: Calibration, poses: Array) -> Calibration:
+def _with_wider_limits(draft: Draft, poses: Array) -> Draft:
     """Let a bundle's limits hold the poses (n, 7) of the new data, too."""
-    pose = calibration.pose
+    pose = draft.pose
     if pose.reference_q_xyzw is None:
         coordinates = known_coordinates(poses, mean_rotation(poses[:, 3:]))
         found = _with_any_rotation(plausible(coordinates, FEW_POSES_MARGIN))
@@ -296,32 +284,11 @@ def _with_wider_limits(calibration: Calibration, poses: Array) -> Calibration:
         lowest=six(np.minimum(pose.limits.lowest, found.lowest)),
         highest=six(np.maximum(pose.limits.highest, found.highest)),
     )
-    return replace(calibration, pose=replace(pose, limits=limits))
+    return replace(draft, pose=msgspec.structs.replace(pose, limits=limits))
 
 
-def _given_candidates(draft: Calibration) -> tuple[Candidate, ...]:
+def _given_candidates(draft: Draft) -> tuple[Candidate, ...]:
     floor = six(HALF_WIDTH_FLOOR * np.array(draft.pose.standard_deviation))
     parameters = CqrParameters(half_width_floor=floor, sides="symmetric")
     scores = ("residual",) if len(draft.model.outputs) == 1 else ("normalised", "additive")
     return tuple(Candidate(score, parameters) for score in scores)
-
-
-def _own_candidates(calibration: Calibration) -> tuple[Candidate, ...]:
-    """A bundle's own score first, then what else its method could use with these parameters."""
-    head = HEADS[calibration.method]
-    parameters = calibration.parameters(head.parameters_type)
-    own = Candidate(calibration.calibration.score, parameters)
-    if isinstance(parameters, CspParameters):
-        raps = parameters
-        if parameters.penalty == 0.0:
-            raps = replace(parameters, penalty=_PENALTY, free_ranks=_FREE_RANKS)
-        family: tuple[Candidate, ...] = (
-            Candidate("aps", parameters),
-            Candidate("lac", parameters),
-            Candidate("raps", raps),
-        )
-    elif own.score == "residual":
-        family = (own,)
-    else:
-        family = (Candidate("normalised", parameters), Candidate("additive", parameters))
-    return (own, *(other for other in family if other.score != own.score))

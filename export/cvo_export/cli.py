@@ -516,9 +516,9 @@ def calibrate(
     and, for intervals that adapt, lower and upper [1, 6].
     """
     from cvo_edge.programs.inspect import inspect_lines
-    from cvo_export.calibrate import recalibrate
+    from cvo_export.calibrate import calibrate as calibrate_network
 
-    calibration = recalibrate(
+    calibration = calibrate_network(
         model,
         _open(dataset),
         bundle,

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import (
     Calibration,
-    CalibrationSpec,
+    Joint,
     PoseSpec,
     Precision,
     PreprocessSpec,
     Provenance,
     Provider,
+    Rule,
 )
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
@@ -26,14 +27,14 @@ from cvo_edge.input import preprocess
 from cvo_export.bundles.draft import (
     CAMERA_FRAME,
     WORLD_FRAME,
-    blank_selftest,
+    Draft,
     four,
     model_spec,
     plausible,
     six,
     versions,
 )
-from cvo_export.bundles.thresholds import Joint, Rule, calibrated, selected
+from cvo_export.bundles.thresholds import calibrated, selected
 from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.graph.quantise import quantised
 from cvo_export.graph.to_onnx import OPSET, check_parity, export_onnx
@@ -148,15 +149,14 @@ def _draft(
     joint: Joint,
     parity: float,
     provider: Provider,
-) -> Calibration:
+) -> Draft:
     """Everything but score, thresholds and self-test."""
     config, target = run.config, run.target
     roles = run.split.roles
     model = model_spec(model_bytes, OPSET, provider)
     # Of all frames of these roles, also where a run was given a share: the unit of its score.
     known = target.coordinates(run.dataset.poses[np.concatenate([roles["train"], roles["fit"]])])
-    return Calibration(
-        schema_version=1,
+    return Draft(
         name=name,
         method=run.graph.head.runtime_method,
         model=model,
@@ -181,19 +181,6 @@ def _draft(
             limits=plausible(known),
             standard_deviation=six(known.std(axis=0)),
         ),
-        thresholds=(),
-        method_parameters={},
-        calibration=CalibrationSpec(
-            score="",
-            joint=joint,
-            rule=rule,
-            n=1,
-            n_sequences=1,
-            n_effective=1.0,
-            split=run.split.spec(run.dataset),
-            dataset=run.dataset.name,
-        ),
-        selftest=blank_selftest(model.precision),
         provenance=Provenance(
             created_with=versions((*_PACKAGES, provider)),
             seed=config.seed,
@@ -209,7 +196,10 @@ def _draft(
                 "parity": float(f"{parity:.3g}"),
             },
         ),
-        digest="0" * 64,
+        rule=rule,
+        joint=joint,
+        split=run.split.spec(run.dataset),
+        dataset=run.dataset.name,
     )
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from cvo_edge.bundle.format import Calibration
-from cvo_edge.bundle.reading import read_bundle
 from cvo_edge.bundle.signature import (
     HIGHEST_VERSION,
     MAX_KEY_BYTES,
@@ -19,6 +18,7 @@ from cvo_edge.bundle.signature import (
     Signature,
     message,
 )
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import UsageError
 from cvo_edge.files import read_regular_file
 from cvo_export.files import write_json
@@ -61,7 +61,7 @@ def sign(folder: Path, key: Path, version: int | None = None) -> Signature:
     def take(_: Path, __: Calibration, content: bytes) -> None:
         digests.append(hashlib.sha256(content).hexdigest())
 
-    calibration = read_bundle(folder, take).calibration
+    calibration = read_bundle(folder, check=take).calibration
     (digest,) = digests
     signature = Signature(
         schema_version=1,

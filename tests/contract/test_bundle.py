@@ -14,12 +14,8 @@ from hypothesis import strategies as st
 
 from cvo_edge import BundleMismatchError, CalibrationFileError, ModelError, Odometer
 from cvo_edge.bundle.format import MODEL_FILE
-from cvo_edge.bundle.reading import (
-    decode_calibration,
-    encode_calibration,
-    read_bundle,
-    read_calibration,
-)
+from cvo_edge.bundle.reading import decode_calibration, encode_calibration, read_calibration
+from cvo_edge.engine.loading import read_bundle
 
 
 def redigested(document):

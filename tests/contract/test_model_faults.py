@@ -72,7 +72,7 @@ def odometer(
             for scope in ("marginal", "joint")
         ),
     )
-    return Odometer(Bundle(decode_calibration(encode_calibration(changed)), model_bytes))
+    return Odometer(Bundle.of(decode_calibration(encode_calibration(changed)), model_bytes))
 
 
 def step(bundle, **outputs):

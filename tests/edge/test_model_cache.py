@@ -14,14 +14,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from cvo_edge.bundle.reading import Bundle, read_bundle
-from cvo_edge.engine.loading import PreparedBundle, load_bundle
+from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.model_cache import (
     ENTRY_FILE,
     GRAPH_FILE,
     SEEN_FILE,
     WEIGHTS_FILE,
     ModelCache,
+    PreparedModel,
     file_digests,
 )
 from cvo_edge.engine.session import Session
@@ -58,7 +58,7 @@ def test_a_prepared_model_computes_the_very_same(method, bundle_dir, clip_dir, c
             for other in others:
                 for name, values in expected.outputs.items():
                     assert np.array_equal(values, other.outputs[name])
-    assert isinstance(load_bundle(folder, cache), PreparedBundle)
+    assert isinstance(read_bundle(folder, cache=cache).model, PreparedModel)
 
 
 def test_what_is_prepared_is_the_same_whatever_a_calibration_says_of_it(
@@ -81,14 +81,14 @@ def test_what_is_prepared_is_the_same_whatever_a_calibration_says_of_it(
 @pytest.mark.parametrize("file", [GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE])
 def test_a_changed_byte_is_never_used(file, bundle_dir, bundle, cache):
     sha256 = bundle.calibration.model.sha256
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     path = entry_folder(cache) / file
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     assert cache.find(sha256) is None
     assert not path.exists()
-    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
     assert cache.find(sha256) is not None
 
 
@@ -103,18 +103,18 @@ def make_dangling_link(path: Path) -> None:
 @pytest.mark.parametrize("make", [os.mkfifo, make_folder, make_dangling_link])
 @pytest.mark.parametrize("file", [GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE, SEEN_FILE])
 def test_what_is_no_file_is_neither_waited_for_nor_followed(file, make, bundle_dir, bundle, cache):
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     path = entry_folder(cache) / file
     path.unlink(missing_ok=True)
     make(path)
     cache_lines(cache)
-    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
     assert cache.find(bundle.calibration.model.sha256) is not None
 
 
 def test_what_is_prepared_is_of_this_model_and_this_engine(bundle_dir, bundle, cache):
     """Of two bundles that agree in every name and shape none runs with the other's model."""
-    prepared = load_bundle(bundle_dir, cache).prepared
+    prepared = read_bundle(bundle_dir, cache=cache).model
     eight = read_bundle(bundle_dir.with_name("synthetic-room-cjp-int8")).calibration
     elsewhere = msgspec.structs.replace(
         bundle.calibration,
@@ -122,12 +122,12 @@ def test_what_is_prepared_is_of_this_model_and_this_engine(bundle_dir, bundle, c
     )
     for calibration in (eight, elsewhere):
         with pytest.raises(BundleMismatchError, match="prepared model: expected"):
-            Odometer(PreparedBundle(calibration, prepared))
+            Odometer(Bundle.of(calibration, prepared))
 
 
 def test_verify_asks_the_prepared_model_too(bundle_dir, cache, monkeypatch):
     """An entry that was written with other weights, its digests made to fit."""
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     monkeypatch.setenv("CVO_EDGE_CACHE", str(cache.folder))
     command = [*CVO_EDGE, "verify", str(bundle_dir)]
     assert subprocess.run(command, capture_output=True, check=False).returncode == 0
@@ -144,14 +144,14 @@ def test_verify_asks_the_prepared_model_too(bundle_dir, cache, monkeypatch):
 
 @pytest.mark.parametrize("file", [GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE])
 def test_a_missing_file_is_a_missing_entry(file, bundle_dir, bundle, cache):
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     (entry_folder(cache) / file).unlink()
     assert cache.find(bundle.calibration.model.sha256) is None
 
 
 @pytest.mark.parametrize("key", ["model_sha256", "onnxruntime", "processor"])
 def test_an_entry_of_something_else_is_not_used(key, bundle_dir, bundle, cache):
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     path = entry_folder(cache) / ENTRY_FILE
     entry = json.loads(path.read_bytes())
     path.write_text(json.dumps({**entry, key: "of another"}))
@@ -159,7 +159,7 @@ def test_an_entry_of_something_else_is_not_used(key, bundle_dir, bundle, cache):
 
 
 def test_a_swapped_model_is_refused_whatever_the_cache_holds(copied_bundle, cache):
-    load_bundle(copied_bundle, cache)
+    read_bundle(copied_bundle, cache=cache)
     path = copied_bundle / "model.onnx"
     path.write_bytes(path.read_bytes() + b"\0")
     with pytest.raises(BundleMismatchError, match=hashlib.sha256(path.read_bytes()).hexdigest()):
@@ -173,20 +173,20 @@ def settled(monkeypatch):
 
 
 def test_the_digest_of_an_unchanged_model_is_taken_once(copied_bundle, cache, settled, monkeypatch):
-    load_bundle(copied_bundle, cache)
-    load_bundle(copied_bundle, cache)
+    read_bundle(copied_bundle, cache=cache)
+    read_bundle(copied_bundle, cache=cache)
     taken = []
     monkeypatch.setattr("cvo_edge.engine.loading.check_model_file", lambda *_: taken.append(1))
-    load_bundle(copied_bundle, cache)
+    read_bundle(copied_bundle, cache=cache)
     assert not taken
     (copied_bundle / "model.onnx").touch()
-    load_bundle(copied_bundle, cache)
+    read_bundle(copied_bundle, cache=cache)
     assert taken
 
 
 def test_a_model_of_the_same_size_and_times_is_refused(copied_bundle, cache, settled):
     for _ in range(2):
-        load_bundle(copied_bundle, cache)
+        read_bundle(copied_bundle, cache=cache)
     path = copied_bundle / "model.onnx"
     before = path.stat()
     content = bytearray(path.read_bytes())
@@ -195,7 +195,7 @@ def test_a_model_of_the_same_size_and_times_is_refused(copied_bundle, cache, set
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert (path.stat().st_size, path.stat().st_mtime_ns) == (before.st_size, before.st_mtime_ns)
     with pytest.raises(BundleMismatchError):
-        load_bundle(copied_bundle, cache)
+        read_bundle(copied_bundle, cache=cache)
 
 
 def test_a_file_that_has_just_changed_is_not_remembered(copied_bundle, cache):
@@ -203,32 +203,34 @@ def test_a_file_that_has_just_changed_is_not_remembered(copied_bundle, cache):
     soon = time.time() + 3600
     os.utime(copied_bundle / "model.onnx", (soon, soon))
     for _ in range(2):
-        load_bundle(copied_bundle, cache)
+        read_bundle(copied_bundle, cache=cache)
     assert not (entry_folder(cache) / SEEN_FILE).exists()
 
 
 def test_a_link_in_place_of_a_model_is_refused(copied_bundle, cache, settled, tmp_path):
     for _ in range(2):
-        load_bundle(copied_bundle, cache)
+        read_bundle(copied_bundle, cache=cache)
     path = copied_bundle / "model.onnx"
     path.rename(tmp_path / "elsewhere.onnx")
     path.symlink_to(tmp_path / "elsewhere.onnx")
     with pytest.raises(ModelError):
-        load_bundle(copied_bundle, cache)
+        read_bundle(copied_bundle, cache=cache)
 
 
 def test_a_folder_that_others_may_write_to_is_not_used(bundle_dir, cache):
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     cache.folder.chmod(0o777)
-    assert isinstance(load_bundle(bundle_dir, cache), Bundle)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, bytes)
     cache.folder.chmod(0o700)
-    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
 
 
 def test_a_cache_that_cannot_be_made_costs_nothing_but_itself(bundle_dir, tmp_path):
     (tmp_path / "file").write_text("no folder")
-    assert isinstance(load_bundle(bundle_dir, ModelCache(tmp_path / "file")), Bundle)
-    assert isinstance(load_bundle(bundle_dir, ModelCache(tmp_path / "file" / "below")), Bundle)
+    assert isinstance(read_bundle(bundle_dir, cache=ModelCache(tmp_path / "file")).model, bytes)
+    assert isinstance(
+        read_bundle(bundle_dir, cache=ModelCache(tmp_path / "file" / "below")).model, bytes
+    )
 
 
 def test_a_full_disk_costs_the_entry_alone(bundle_dir, clip_dir, tmp_path):
@@ -272,13 +274,13 @@ def test_what_an_interrupted_build_left_is_swept_when_it_is_old(bundle_dir, cach
     assert old is not None
     assert young is not None
     os.utime(old, (0, 0))
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     assert not old.exists()
     assert young.exists()
 
 
 def test_clear_removes_what_is_the_caches_own(bundle_dir, cache):
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     cache.new_folder()
     (cache.folder / "someone's").mkdir()
     (cache.folder / "note.txt").write_text("mine")
@@ -294,7 +296,7 @@ def test_clear_removes_what_is_the_caches_own(bundle_dir, cache):
 
 
 def test_a_damaged_entry_can_be_cleared(bundle_dir, cache):
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     (entry_folder(cache) / ENTRY_FILE).write_text("{")
     assert cache.entries() == []
     assert cache.clear() == 1
@@ -302,10 +304,10 @@ def test_a_damaged_entry_can_be_cleared(bundle_dir, cache):
 
 
 def test_an_entry_that_cannot_be_read_now_is_kept(bundle_dir, bundle, cache, monkeypatch):
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     with monkeypatch.context() as patch:
         patch.setattr("cvo_edge.engine.model_cache.file_digests", too_many_open_files)
-        assert isinstance(load_bundle(bundle_dir, cache), Bundle)
+        assert isinstance(read_bundle(bundle_dir, cache=cache).model, bytes)
     assert cache.find(bundle.calibration.model.sha256) is not None
 
 
@@ -314,13 +316,14 @@ def too_many_open_files(path):
 
 
 def test_an_entry_that_vanishes_while_it_is_loaded_is_done_without(bundle_dir, cache, monkeypatch):
-    def load_and_clear(folder, of, check):
-        found = load_bundle(folder, of, check)
-        of.clear()
+    def read_and_clear(folder, *, cache, check):
+        found = read_bundle(folder, cache=cache, check=check)
+        if cache is not None:
+            cache.clear()
         return found
 
-    load_bundle(bundle_dir, cache)
-    monkeypatch.setattr("cvo_edge.odometer.load_bundle", load_and_clear)
+    read_bundle(bundle_dir, cache=cache)
+    monkeypatch.setattr("cvo_edge.odometer.read_bundle", read_and_clear)
     with Odometer.load(bundle_dir, cache=cache) as odometer:
         assert check_selftest(odometer) < odometer.calibration.selftest.tolerance
 
@@ -329,7 +332,7 @@ def test_a_user_without_a_home_has_no_cache(bundle_dir, monkeypatch):
     monkeypatch.delenv("CVO_EDGE_CACHE", raising=False)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(Path, "expanduser", homeless)
-    assert isinstance(load_bundle(bundle_dir, ModelCache.default()), Bundle)
+    assert isinstance(read_bundle(bundle_dir, cache=ModelCache.default()).model, bytes)
     assert ModelCache.default().clear() == 0
     assert ModelCache.default().entries() == []
 
@@ -339,7 +342,7 @@ def homeless(path):
 
 
 def test_the_list_says_why_a_cache_is_not_used(bundle_dir, cache):
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     assert cache.obstacle() is None
     cache.folder.chmod(0o775)
     assert "nobody else may write to" in (cache.obstacle() or "")
@@ -388,19 +391,19 @@ def test_a_bundle_without_a_cache_is_read_as_before(bundle_dir):
 
 @pytest.mark.parametrize("content", [b'{"name":"\xff"}', b"[" * 100_000, b"", b"{}", b"null"])
 def test_an_entry_that_is_no_text_costs_its_advantage_only(content, bundle_dir, bundle, cache):
-    load_bundle(bundle_dir, cache)
+    read_bundle(bundle_dir, cache=cache)
     path = entry_folder(cache) / ENTRY_FILE
     path.write_bytes(content)
     assert cache.entries() == []
     assert cache.find(bundle.calibration.model.sha256) is None
-    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
     (entry_folder(cache) / SEEN_FILE).write_bytes(content)
-    assert isinstance(load_bundle(bundle_dir, cache), PreparedBundle)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
 
 
 def test_a_model_that_has_grown_beyond_its_limit_is_refused_at_once(copied_bundle, cache):
-    load_bundle(copied_bundle, cache)
+    read_bundle(copied_bundle, cache=cache)
     with (copied_bundle / "model.onnx").open("r+b") as stream:
         stream.truncate(300 << 30)
     with pytest.raises(ModelError, match="at most 1073741824 bytes"):
-        load_bundle(copied_bundle, cache)
+        read_bundle(copied_bundle, cache=cache)

@@ -12,10 +12,11 @@ from torch.nn.functional import linear, prelu
 
 from cvo_edge import Odometer
 from cvo_edge.bundle.format import Threshold
-from cvo_edge.bundle.reading import read_bundle, read_calibration
+from cvo_edge.bundle.reading import read_calibration
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import UsageError
 from cvo_edge.heads import CqrHead
-from cvo_export.bundles.thresholds import Candidate, observe, with_candidate
+from cvo_export.bundles.thresholds import observe
 from cvo_export.cli import MethodName
 from cvo_export.evaluate import evaluate, find_level, table
 from cvo_export.networks.backbone import BackboneConfig
@@ -336,12 +337,7 @@ def test_own_figures_are_those_of_cqr_at_the_threshold_zero(runs, name):
         assert not any("own bounds" in line for line in table(report))
         return
     content = read_bundle(bundle)
-    head = CqrHead(
-        with_candidate(
-            content.calibration,
-            Candidate("additive", content.calibration.parameters(CqrHead.parameters_type)),
-        )
-    )
+    head = CqrHead(content.head.parameters, "additive")
     zero = Threshold(confidence=0.9, scope="marginal", q_hat=(0.0,) * 6, q_hat_upper=None)
     with Odometer(content) as odometer:
         seen = observe(odometer, run.dataset, run.split.roles["test"])

@@ -8,14 +8,15 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from cvo_edge import Odometer
-from cvo_edge.bundle.reading import read_bundle, read_calibration
+from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.conformal import conformal_quantile
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import BundleMismatchError, CvoError, ModelError, SinkError, UsageError
 from cvo_edge.geometry import mean_rotation
 from cvo_edge.programs.inspect import inspect_lines
 from cvo_edge.programs.selftest import check_selftest
 from cvo_export.bundles.thresholds import observe
-from cvo_export.calibrate import recalibrate
+from cvo_export.calibrate import calibrate
 from cvo_export.cli import app
 from cvo_export.data.splits import same_split
 from cvo_export.datasets import open_dataset
@@ -76,7 +77,7 @@ def model_file(dataset, tmp_path):
 
 
 def test_a_point_network_gets_order_statistics_of_its_residuals(model_file, dataset, tmp_path):
-    calibration = recalibrate(model_file, dataset, tmp_path / "b", "own", kind="random")
+    calibration = calibrate(model_file, dataset, tmp_path / "b", "own", kind="random")
     assert (calibration.method, calibration.calibration.score) == ("cqr", "residual")
     split = same_split(dataset, calibration.calibration.split)
     with Odometer.load(tmp_path / "b") as odometer:
@@ -94,7 +95,7 @@ def test_a_point_network_gets_order_statistics_of_its_residuals(model_file, data
 def test_a_network_with_bounds_gets_the_scores_of_quantile_regression(dataset, tmp_path, rotation):
     path = tmp_path / "own.onnx"
     path.write_bytes(own_model(dataset, bounds=True))
-    calibration = recalibrate(
+    calibration = calibrate(
         path, dataset, tmp_path / "b", "own", kind="random", rotation=rotation, score="additive"
     )
     assert calibration.calibration.score == "additive"
@@ -104,7 +105,7 @@ def test_a_network_with_bounds_gets_the_scores_of_quantile_regression(dataset, t
 
 
 def test_sides_joint_scope_and_rule_are_those_asked_for(model_file, dataset, tmp_path):
-    calibration = recalibrate(
+    calibration = calibrate(
         *(model_file, dataset, tmp_path / "b", "own"),
         kind="sequence",
         sides="asymmetric",
@@ -120,7 +121,7 @@ def test_sides_joint_scope_and_rule_are_those_asked_for(model_file, dataset, tmp
 
 def test_few_frames_are_unbounded_and_said_to_be(model_file, tmp_path):
     few = open_dataset("synthetic:room,flights=1,frames=12,size=64x48")
-    calibration = recalibrate(model_file, few, tmp_path / "b", "few", kind="random")
+    calibration = calibrate(model_file, few, tmp_path / "b", "few", kind="random")
     assert calibration.calibration.n == 8
     assert calibration.threshold(0.8, "marginal").q_hat != (None,) * 6
     assert calibration.threshold(0.9, "marginal").q_hat == (None,) * 6
@@ -133,7 +134,7 @@ def test_few_frames_are_unbounded_and_said_to_be(model_file, tmp_path):
 
 def test_what_two_sides_and_bonferroni_would_need_is_said(model_file, dataset, tmp_path):
     lines = inspect_lines(
-        recalibrate(
+        calibrate(
             *(model_file, dataset, tmp_path / "b", "own"),
             kind="random",
             sides="asymmetric",
@@ -147,7 +148,7 @@ def test_what_two_sides_and_bonferroni_would_need_is_said(model_file, dataset, t
 
 def test_a_bundle_keeps_its_model_and_method_on_new_data(tiny_bundle, dataset, tmp_path):
     before = read_bundle(tiny_bundle)
-    recalibrate(tiny_bundle, dataset, tmp_path / "b", "new site", kind="random", new_data=True)
+    calibrate(tiny_bundle, dataset, tmp_path / "b", "new site", kind="random", new_data=True)
     after = read_bundle(tmp_path / "b")
     assert after.model_bytes == before.model_bytes
     assert after.calibration.method == before.calibration.method
@@ -165,7 +166,7 @@ def test_a_bundle_keeps_its_model_and_method_on_new_data(tiny_bundle, dataset, t
 def test_on_the_runs_own_data_the_frames_it_trained_on_stay_out(tiny_bundle, tiny_run, tmp_path):
     # The same val and cal as the run, so the same thresholds to the last bit.
     before = read_calibration(tiny_bundle)
-    after = recalibrate(
+    after = calibrate(
         tiny_bundle, tiny_run.dataset, tmp_path / "b", "again", score=before.calibration.score
     )
     assert after.thresholds == before.thresholds
@@ -176,7 +177,7 @@ def test_other_frames_of_the_training_datas_name_need_a_word(tiny_bundle, tmp_pa
     # Eight of the nine flights are those that the network was trained on.
     superset = open_dataset("synthetic:room,flights=9,frames=40,size=64x48")
     with pytest.raises(UsageError, match="--new-data"):
-        recalibrate(tiny_bundle, superset, tmp_path / "b", "leak", kind="random")
+        calibrate(tiny_bundle, superset, tmp_path / "b", "leak", kind="random")
     assert not (tmp_path / "b").exists()
 
 
@@ -184,8 +185,8 @@ def test_the_run_is_remembered_when_a_bundle_comes_back_to_its_own_data(
     tiny_bundle, tiny_run, dataset, tmp_path
 ):
     before = read_calibration(tiny_bundle)
-    recalibrate(tiny_bundle, dataset, tmp_path / "b", "away", kind="random", new_data=True)
-    after = recalibrate(
+    calibrate(tiny_bundle, dataset, tmp_path / "b", "away", kind="random", new_data=True)
+    after = calibrate(
         tmp_path / "b", tiny_run.dataset, tmp_path / "c", "home", score=before.calibration.score
     )
     assert after.calibration.split == before.calibration.split
@@ -195,12 +196,12 @@ def test_the_run_is_remembered_when_a_bundle_comes_back_to_its_own_data(
 @pytest.mark.parametrize("given", [{"rotation": "euler_zyx"}, {"crop": "centre"}])
 def test_options_of_a_model_file_are_refused_with_a_bundle(tiny_bundle, dataset, tmp_path, given):
     with pytest.raises(UsageError, match="expected with an ONNX file"):
-        recalibrate(tiny_bundle, dataset, tmp_path / "b", "b", **given)
+        calibrate(tiny_bundle, dataset, tmp_path / "b", "b", **given)
 
 
 def test_a_split_is_not_asked_for_on_the_runs_own_data(tiny_bundle, tiny_run, tmp_path):
     with pytest.raises(UsageError, match="whose own roles are used"):
-        recalibrate(tiny_bundle, tiny_run.dataset, tmp_path / "b", "b", kind="random")
+        calibrate(tiny_bundle, tiny_run.dataset, tmp_path / "b", "b", kind="random")
 
 
 def test_a_network_is_calibrated_where_torch_is_not_installed(model_file, tmp_path):
@@ -240,7 +241,7 @@ def test_what_is_no_such_model_is_refused(dataset, tmp_path, content, error, mat
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(error, match=match):
-        recalibrate(path, dataset, tmp_path / "b", "wrong")
+        calibrate(path, dataset, tmp_path / "b", "wrong")
     assert not (tmp_path / "b").exists()
 
 
@@ -268,6 +269,6 @@ def test_a_folder_with_other_files_is_left_alone(model_file, dataset, tmp_path):
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "precious.txt").write_text("keep")
     with pytest.raises(SinkError):
-        recalibrate(model_file, dataset, tmp_path / "b", "own")
+        calibrate(model_file, dataset, tmp_path / "b", "own")
     with pytest.raises(UsageError, match="score"):
-        recalibrate(model_file, dataset, tmp_path / "c", "own", score="lac", kind="random")
+        calibrate(model_file, dataset, tmp_path / "c", "own", score="lac", kind="random")

@@ -9,9 +9,10 @@ import pytest
 
 from cvo_edge import Odometer
 from cvo_edge.errors import CvoError, GateError, SourceError
+from cvo_export.bundles.figures import coverage_band
 from cvo_export.cli import app
 from cvo_export.datasets import open_dataset
-from cvo_export.evaluate import check_coverage, coverage_band, evaluate, find_level, table
+from cvo_export.evaluate import check_coverage, evaluate, find_level, table
 
 from .conftest import DATASET
 

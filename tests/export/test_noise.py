@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_export.calibrate import recalibrate
+from cvo_export.calibrate import calibrate
 from cvo_export.cli import app
 from cvo_export.data.noise import KINDS, Noise, noisy, parse_noise
 from cvo_export.data.splits import make_split, same_split
@@ -338,7 +338,7 @@ def test_frames_that_a_check_flags_are_counted_in_both_roles(tiny_bundle, tiny_r
 
 def test_a_split_by_sequence_is_indicative_after_recalibration(tiny_bundle, tmp_path):
     other = open_dataset("synthetic:room,flights=12,frames=10,size=64x48,seed=4")
-    calibration = recalibrate(
+    calibration = calibrate(
         *(tiny_bundle, other, tmp_path / "b", "b"), kind="sequence", rule="pooled", new_data=True
     )
     found = evaluate(tmp_path / "b", other, "test", noise=parse_noise("exposure"))

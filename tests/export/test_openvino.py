@@ -12,15 +12,15 @@ from msgspec.structs import replace
 from onnx import TensorProto, helper
 
 from cvo_edge.bundle.format import TensorSpec
-from cvo_edge.bundle.reading import Bundle, read_bundle, read_calibration
-from cvo_edge.engine.loading import load_bundle
+from cvo_edge.bundle.reading import read_calibration
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.engine.openvino import OpenvinoSession
 from cvo_edge.errors import ModelError
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.inspect import inspect_lines
 from cvo_edge.programs.selftest import check_selftest
-from cvo_export.calibrate import recalibrate
+from cvo_export.calibrate import calibrate
 from cvo_export.datasets import open_dataset
 from cvo_export.publish import publish
 
@@ -41,7 +41,7 @@ def eight(tiny_run, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def of_openvino(eight, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("eight") / "openvino"
-    recalibrate(eight, open_dataset(DATASET), folder, "eight", provider="openvino")
+    calibrate(eight, open_dataset(DATASET), folder, "eight", provider="openvino")
     return folder
 
 
@@ -111,7 +111,7 @@ def test_workers_beside_each_other_give_what_one_gives(of_openvino):
 
 def test_its_models_are_not_prepared_for_the_other_engine(of_openvino, tmp_path):
     cache = ModelCache(tmp_path / "cache")
-    assert isinstance(load_bundle(of_openvino, cache), Bundle)
+    assert isinstance(read_bundle(of_openvino, cache=cache).model, bytes)
     assert cache.entries() == []
 
 

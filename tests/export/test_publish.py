@@ -11,8 +11,9 @@ import torch
 
 from cvo_edge import Odometer, SinkError, SourceError
 from cvo_edge.bundle.format import CONFIDENCES
-from cvo_edge.bundle.reading import read_bundle, read_calibration
+from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.conformal import conformal_quantile
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
 from cvo_edge.programs.selftest import check_selftest

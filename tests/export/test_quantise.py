@@ -9,9 +9,9 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from cvo_edge.bundle.reading import read_bundle
 from cvo_edge.conformal import conformal_quantile
 from cvo_edge.engine import session
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import UsageError
 from cvo_edge.odometer import Odometer

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cvo_export.evaluate import adaptiveness
+from cvo_export.bundles.figures import adaptiveness
 from cvo_export.study.cells import Cell, CellFolder, Figures, NoiseFigures, Seconds, Width
 from cvo_export.study.grid import Grid, Place, Results, Study
 from cvo_export.study.report import _Report

@@ -1,11 +1,14 @@
-"""A bundle folder, written whole or not at all; and what every draft of one has in common."""
+"""A bundle before it is calibrated: all that is known without a score or a threshold."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import onnx
 from numpy.typing import NDArray
@@ -13,16 +16,29 @@ from numpy.typing import NDArray
 from cvo_edge import geometry
 from cvo_edge.bundle.format import (
     MODEL_FILE,
+    Calibration,
+    CalibrationSpec,
+    Joint,
     ModelSpec,
     PoseLimits,
+    PoseSpec,
     Precision,
+    PreprocessSpec,
+    Provenance,
     Provider,
     Quaternion,
+    Rule,
     SelfTest,
     Six,
     SixPositive,
+    SplitSpec,
+    Threshold,
 )
+from cvo_edge.bundle.reading import UNWRITTEN
 from cvo_edge.engine.session import Session
+from cvo_edge.heads import HEADS, Candidate, Head
+from cvo_edge.heads.checked import check_tensors
+from cvo_edge.observer import Observer
 from cvo_edge.pose import Chart
 
 Array = NDArray[np.float64]
@@ -52,8 +68,113 @@ _QUANTISED = {
     "QLinearMatMul",
     "QuantizeLinear",
 }
-# Of another shape than any camera and model, so that resize and crop are tested, too.
-_SELFTEST_SIZE = (418, 650)
+# Height and width of the self-test's image: of another shape than any camera and model, so that
+# resize and crop are tested, too.
+SELFTEST_SIZE = (418, 650)
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What a bundle says that does not depend on its calibration; see ``Calibration``.
+
+    Attributes
+    ----------
+    method
+        Name of the runtime's head.
+    rule, joint, split, dataset
+        How thresholds are to be made, and of which frames.
+    """
+
+    name: str
+    method: str
+    model: ModelSpec
+    preprocess: PreprocessSpec
+    pose: PoseSpec
+    provenance: Provenance
+    rule: Rule
+    joint: Joint
+    split: SplitSpec
+    dataset: str
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> Draft:
+        """Return the draft of a bundle, to be calibrated again."""
+        source = calibration.calibration
+        return cls(
+            name=calibration.name,
+            method=calibration.method,
+            model=calibration.model,
+            preprocess=calibration.preprocess,
+            pose=calibration.pose,
+            provenance=calibration.provenance,
+            rule=source.rule,
+            joint=source.joint,
+            split=source.split,
+            dataset=source.dataset,
+        )
+
+    def head(self, candidate: Candidate) -> Head:
+        """Return the method with one of its scores.
+
+        Raises BundleMismatchError where the model does not have the tensors that it works with.
+        """
+        head = HEADS[self.method](candidate.parameters, candidate.score)
+        check_tensors(self.model, head)
+        return head
+
+    def observer(self, model_bytes: bytes, head: Head) -> Observer:
+        """Return what runs the network on frames; raises ModelError and BundleMismatchError."""
+        return Observer(model_bytes, self.model, self.preprocess, self.pose, head)
+
+    def calibrated(
+        self,
+        head: Head,
+        thresholds: tuple[Threshold, ...],
+        counts: Counts,
+        selftest: Mapping[str, tuple[float, ...]],
+    ) -> Calibration:
+        """Return the whole of ``calibration.json``, without the digest that writing gives it.
+
+        ``selftest``: each output of the network for the image of the self-test.
+        """
+        height, width = SELFTEST_SIZE
+        return Calibration(
+            schema_version=1,
+            name=self.name,
+            method=self.method,
+            model=self.model,
+            preprocess=self.preprocess,
+            pose=self.pose,
+            thresholds=thresholds,
+            method_parameters=msgspec.to_builtins(head.parameters),
+            calibration=CalibrationSpec(
+                score=head.score,
+                joint=self.joint,
+                rule=self.rule,
+                n=counts.frames,
+                n_sequences=counts.sequences,
+                n_effective=counts.effective,
+                split=self.split,
+                dataset=self.dataset,
+            ),
+            selftest=SelfTest(
+                recipe="ripples-1",
+                height=height,
+                width=width,
+                outputs=dict(selftest),
+                tolerance=_SELFTEST_TOLERANCE[self.model.precision],
+            ),
+            provenance=self.provenance,
+            digest=UNWRITTEN,
+        )
+
+
+class Counts(NamedTuple):
+    """What thresholds are of: frames, sequences, and the independent frames they are worth."""
+
+    frames: int
+    sequences: int
+    effective: float
 
 
 def model_spec(model_bytes: bytes, opset: int, provider: Provider = "onnxruntime") -> ModelSpec:
@@ -105,18 +226,6 @@ def plausible(coordinates: Array, least_margin: float = 0.0) -> PoseLimits:
     lowest, highest = coordinates.min(axis=0), coordinates.max(axis=0)
     margin = np.maximum(_LIMIT_MARGIN * (highest - lowest), least_margin)
     return PoseLimits(lowest=six(lowest - margin), highest=six(highest + margin))
-
-
-def blank_selftest(precision: Precision) -> SelfTest:
-    """Return the self-test without the outputs that the model must give."""
-    height, width = _SELFTEST_SIZE
-    return SelfTest(
-        recipe="ripples-1",
-        height=height,
-        width=width,
-        outputs={},
-        tolerance=_SELFTEST_TOLERANCE[precision],
-    )
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:

@@ -8,16 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
-import msgspec
 import numpy as np
-from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import CONFIDENCES, Calibration, SixOrUnbounded, Threshold
-from cvo_edge.bundle.reading import Bundle
+from cvo_edge.bundle.format import (
+    CONFIDENCES,
+    Calibration,
+    Joint,
+    PoseSpec,
+    Rule,
+    SixOrUnbounded,
+    Threshold,
+)
 from cvo_edge.conformal import (
     conformal_quantile,
     effective_sample_size,
@@ -25,28 +30,20 @@ from cvo_edge.conformal import (
     interval_score,
 )
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.heads import HEADS, Head
+from cvo_edge.heads import Candidate, Head
 from cvo_edge.heads.cqr import Sides
-from cvo_edge.odometer import Observation, Odometer
+from cvo_edge.observer import Observation, Observer
+from cvo_edge.odometer import Odometer
 from cvo_edge.programs.selftest import observe_selftest
-from cvo_edge.sets import ConformalSet, Scope
+from cvo_edge.sets import SCOPES, ConformalSet, Scope
+from cvo_export.bundles.draft import SELFTEST_SIZE, Counts, Draft
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
-Rule = Literal["pooled", "hierarchical"]
-Joint = Literal["max", "bonferroni"]
 
-SCOPES: tuple[Scope, Scope] = ("marginal", "joint")
 
 # What another score has to win on val by: smaller differences there are chance.
 _CLEARLY = 0.05
-
-
-class Candidate(NamedTuple):
-    """A score of the runtime's head and the ``method_parameters`` it goes with."""
-
-    score: str
-    parameters: Struct
 
 
 class Scored(NamedTuple):
@@ -95,8 +92,10 @@ class Observed:
         ]
 
 
-def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]) -> Observed:
-    """Run frames of a data set through the odometer's network, in order.
+def observe(
+    observer: Observer | Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
+) -> Observed:
+    """Run frames of a data set through a network, in order.
 
     Raises SourceError where no frame passes the checks.
     """
@@ -107,8 +106,8 @@ def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
         try:
             image = dataset.read_image(index)
         except SourceError:
-            image = None  # the odometer flags it as it would on the device
-        observation = odometer.observe(image, seq=index)
+            image = None  # flagged as it would be on the device
+        observation = observer.observe(image, seq=index)
         if observation.fault is not None:
             invalid += 1
         elif observation.doubt is not None:
@@ -129,7 +128,7 @@ def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
             for name in seen[0].outputs
         },
         point=np.array([observation.point for observation in seen]),
-        truth=odometer.chart.coordinates(true_pose, pose),
+        truth=observer.chart.coordinates(true_pose, pose),
         pose=pose,
         true_pose=true_pose,
         sequence=dataset.sequence[kept],
@@ -139,16 +138,16 @@ def observe(odometer: Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
 
 
 def calibrated(
-    draft: Calibration,
+    draft: Draft,
     model_bytes: bytes,
     dataset: PoseDataset,
     roles: Mapping[str, NDArray[np.int64]],
     candidates: Sequence[Candidate],
 ) -> Calibration:
-    """Fill in score, thresholds and self-test of a draft, by running the model on val and cal.
+    """Calibrate a draft: run its model on val and cal, choose a score, compute thresholds.
 
-    The draft names rule, joint scope, split and data set; val decides among the candidates, see
-    ``chosen``.
+    val decides among the candidates, see ``chosen``, and compares degrees of freedom for the joint
+    scope; cal gives the thresholds.
 
     Raises
     ------
@@ -157,45 +156,54 @@ def calibrated(
     SourceError
         No frame of val or cal passes the checks.
     UsageError
-        Bonferroni's joint scope of a method that has a joint score.
+        Bonferroni's joint scope with a method that has one score for all six.
     """
-    if draft.calibration.joint == "bonferroni" and HEADS[draft.method].one_joint_score:
+    first = draft.head(candidates[0])
+    if draft.joint == "bonferroni" and first.one_joint_score:
         raise UsageError(
             f"joint: expected max for {draft.method}, which has one score for all six, found "
             "bonferroni"
         )
-    first = with_candidate(draft, candidates[0])
-    with Odometer(Bundle(first, model_bytes)) as odometer:
-        val = observe(odometer, dataset, roles["val"])
-        cal = observe(odometer, dataset, roles["cal"])
+    with draft.observer(model_bytes, first) as observer:
+        val = observe(observer, dataset, roles["val"])
+        cal = observe(observer, dataset, roles["cal"])
         selftest = {
             name: tuple(float(f"{value:.9g}") for value in values.reshape(-1).tolist())
-            for name, values in observe_selftest(odometer).outputs.items()
+            for name, values in observe_selftest(observer, *SELFTEST_SIZE).outputs.items()
         }
-    scored = with_candidate(draft, chosen(draft, val, candidates))
-    scored = replace(scored, selftest=replace(scored.selftest, outputs=selftest))
-    return with_thresholds(scored, val, cal)
+    head = draft.head(chosen(draft, val, candidates))
+    scored = cal.scored(head)
+    found = thresholds(head, scored, val.scored(head), draft.rule, draft.joint)
+    return draft.calibrated(head, found, counts(scored), selftest)
 
 
-def with_thresholds(calibration: Calibration, val: Observed, cal: Observed) -> Calibration:
-    """Return the calibration with the thresholds of these observations, and their counts.
+def with_thresholds(
+    calibration: Calibration, head: Head, val: Observed, cal: Observed
+) -> Calibration:
+    """Return a calibration with the thresholds of these observations, and their counts.
 
-    Rule, joint scope and score are its own; val compares degrees of freedom for the joint scope.
-
-    Raises UsageError for a rule that is not computed here.
+    Rule, joint scope and score stay; val compares degrees of freedom for the joint scope.
     """
-    head = HEADS[calibration.method](calibration)
-    cal_scores = cal.scored(head)
-    source, rule = calibration.calibration, rule_of(calibration)
+    source, scored = calibration.calibration, cal.scored(head)
+    found = counts(scored)
     return replace(
         calibration,
-        thresholds=thresholds(head, cal_scores, val.scored(head), rule, source.joint),
+        thresholds=thresholds(head, scored, val.scored(head), source.rule, source.joint),
         calibration=replace(
             source,
-            n=len(cal.indices),
-            n_sequences=len(np.unique(cal.sequence)),
-            n_effective=round(effective_frames(cal_scores), 1),
+            n=found.frames,
+            n_sequences=found.sequences,
+            n_effective=found.effective,
         ),
+    )
+
+
+def counts(cal: Scored) -> Counts:
+    """Return how many frames and sequences scores are of, and what they are worth."""
+    return Counts(
+        frames=len(cal.sequence),
+        sequences=len(np.unique(cal.sequence)),
+        effective=round(effective_frames(cal), 1),
     )
 
 
@@ -221,29 +229,7 @@ def _names(candidate: Candidate) -> tuple[str, ...]:
     return candidate.parameters.__struct_fields__
 
 
-def with_candidate(draft: Calibration, candidate: Candidate) -> Calibration:
-    """Return the draft with this score and its parameters, everything unbounded."""
-    symmetric = getattr(candidate.parameters, "sides", "symmetric") == "symmetric"
-    unbounded: SixOrUnbounded = (None,) * 6
-    entries = tuple(
-        Threshold(
-            confidence=confidence,
-            scope=scope,
-            q_hat=unbounded,
-            q_hat_upper=None if symmetric else unbounded,
-        )
-        for confidence in CONFIDENCES
-        for scope in SCOPES
-    )
-    return replace(
-        draft,
-        thresholds=entries,
-        method_parameters=msgspec.to_builtins(candidate.parameters),
-        calibration=replace(draft.calibration, score=candidate.score),
-    )
-
-
-def chosen(draft: Calibration, val: Observed, candidates: Sequence[Candidate]) -> Candidate:
+def chosen(draft: Draft, val: Observed, candidates: Sequence[Candidate]) -> Candidate:
     """Return the first candidate, unless another's sets on val, thresholded there, clearly win.
 
     By the interval score at 0.9 over each DoF's deviation; val is too small to tell closer ones
@@ -251,25 +237,24 @@ def chosen(draft: Calibration, val: Observed, candidates: Sequence[Candidate]) -
     """
     results = []
     for candidate in candidates:
-        calibration = with_candidate(draft, candidate)
-        head = HEADS[calibration.method](calibration)
+        head = draft.head(candidate)
         scores = head.scores(val.outputs, val.point, val.truth)
         entry = _threshold(0.9, "marginal", marginal_thresholds(head, scores, 0.9, _pooled))
-        limits = workspace(calibration)
+        limits = workspace(draft.pose)
         sets = [each.within(*limits) for each in val.sets(head, entry)]
         width = np.array([each.width() for each in sets])
         distance = np.array([each.distance(y) for each, y in zip(sets, val.truth, strict=True)])
-        deviation = np.array(calibration.pose.standard_deviation)
+        deviation = np.array(draft.pose.standard_deviation)
         results.append(float((interval_score(width, distance, 0.1) / deviation).mean()))
     best = int(np.argmin(results))
     return candidates[best if results[best] < (1.0 - _CLEARLY) * results[0] else 0]
 
 
-def workspace(calibration: Calibration) -> tuple[Array, Array]:
+def workspace(pose: PoseSpec) -> tuple[Array, Array]:
     """Lowest and highest value per DoF, (6,) each, that stand in for an unbounded side."""
-    limits = calibration.pose.limits
+    limits = pose.limits
     lowest, highest = np.array(limits.lowest), np.array(limits.highest)
-    if calibration.pose.rotation == "tangent_predicted":
+    if pose.rotation == "tangent_predicted":
         # Offsets about the prediction: at most a half turn.
         lowest[3:], highest[3:] = -np.pi, np.pi
     return lowest, highest
@@ -317,14 +302,6 @@ def marginal_thresholds(
         if level is not None:
             found[side] = [q_hat(scores[:, side, dof], level) for dof in range(6)]
     return found
-
-
-def rule_of(calibration: Calibration) -> Rule:
-    """The calibration rule of a bundle; raises UsageError for one that is not computed here."""
-    rule = calibration.calibration.rule
-    if rule == "weighted":
-        raise UsageError("rule: expected pooled or hierarchical, found weighted")
-    return rule
 
 
 def effective_frames(scored: Scored) -> float:

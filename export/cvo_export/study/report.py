@@ -13,11 +13,11 @@ import numpy as np
 
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.errors import UsageError
+from cvo_export.bundles.figures import coverage_band
 from cvo_export.data.noise import noisy, parse_noise
 from cvo_export.data.splits import make_split
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.datasets.describe import summary
-from cvo_export.evaluate import coverage_band
 from cvo_export.files import write_whole
 from cvo_export.networks.methods import TRAINABLE
 from cvo_export.study.cells import CONFIDENCE, Cell, CellFolder, Figures

@@ -17,8 +17,8 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from cvo_edge.heads import Candidate
 from cvo_edge.heads.cqr import CqrParameters
-from cvo_export.bundles.thresholds import Candidate
 from cvo_export.networks.heads.base import (
     DOF,
     ExportedHead,

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from cvo_export.bundles.thresholds import Candidate
+from cvo_edge.heads import Candidate
 from cvo_export.networks.baselines.base import TrunkConfig, interval_parameters
 from cvo_export.networks.heads.base import ExportedHead, Lessons, Method, Setting
 from cvo_export.networks.heads.point import PointLearner, PointNetwork

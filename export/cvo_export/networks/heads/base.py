@@ -13,11 +13,11 @@ from msgspec import Struct
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from cvo_edge.bundle.format import MethodName, Six
+from cvo_edge.bundle.format import Six
 from cvo_edge.conformal import conformal_quantile, interval_score
+from cvo_edge.heads import Candidate
 from cvo_edge.pose import Rotation
 from cvo_export.bundles.draft import HALF_WIDTH_FLOOR, six
-from cvo_export.bundles.thresholds import Candidate
 from cvo_export.networks.standardised import Target
 
 Array = NDArray[np.float64]
@@ -107,7 +107,7 @@ class ExportedHead(nn.Module):
     """
 
     output_names: tuple[str, ...]
-    runtime_method: MethodName
+    runtime_method: str
     rotation: Rotation = "tangent_reference"
     extra_inputs: Mapping[str, Tensor] = {}
 

@@ -17,8 +17,8 @@ from scipy.stats import norm, qmc
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from cvo_edge.heads import Candidate
 from cvo_edge.heads.cjp import CjpParameters
-from cvo_export.bundles.thresholds import Candidate
 from cvo_export.networks.heads.base import (
     DOF,
     ExportedHead,

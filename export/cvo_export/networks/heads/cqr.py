@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
+from cvo_edge.heads import Candidate
 from cvo_edge.heads.cqr import CqrParameters
-from cvo_export.bundles.thresholds import Candidate
 from cvo_export.networks.forest import (
     ML_DOMAIN,
     ML_OPSET,

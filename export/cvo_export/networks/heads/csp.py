@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
 from cvo_edge.conformal import conformal_quantile, interval_score
-from cvo_edge.heads.csp import CspParameters, Score, class_scores
-from cvo_export.bundles.thresholds import Candidate
+from cvo_edge.heads import Candidate
+from cvo_edge.heads.csp import CspParameters, class_scores
 from cvo_export.networks.heads.base import (
     DOF,
     ExportedHead,
@@ -194,7 +194,7 @@ def set_score(classes: Classes, probabilities: Array, y: Array) -> Array:
 
     Probabilities (n, 6, K), standardised truth (n, 6).
     """
-    scores = class_scores(probabilities, Score.APS)
+    scores = class_scores(probabilities, "aps")
     edges = classes.edges.numpy()
     index = classes.index(torch.from_numpy(y)).numpy()[..., np.newaxis]
     of_truth = np.take_along_axis(scores, index, axis=-1)[..., 0]

@@ -23,8 +23,8 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvo_edge.heads import Candidate
 from cvo_edge.heads.mcqr import McqrParameters
-from cvo_export.bundles.thresholds import Candidate
 from cvo_export.networks.directional import (
     KAPPAS,
     Choice,
