@@ -12,8 +12,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from markdown import table
-from networks import METHODS
+from markdown_table import table
+from networks import METHODS, demonstration
 from provenance import read_result, result_files
 
 RECORDINGS = ("redkitchen", "kitchen_flights")
@@ -103,7 +103,7 @@ def choice() -> str:
 
     def over_cqr(method: str) -> str:
         ratios = [a / b for a, b in zip(volumes(pairs[method]), volumes(pairs["cqr"]), strict=True)]
-        # Three digits of a large ratio, two of a small one.
+        # One decimal above 1, two below.
         return ", ".join(f"{r:.0f}" if r == 1 else f"{r:.{1 if r > 1 else 2}f}" for r in ratios)
 
     comparison = read_result("compare", "redkitchen")
@@ -214,17 +214,59 @@ def shapes() -> str:
     return table([*head, "box over region", "kappa", "points"], rows)
 
 
+def demonstrations(precision: str) -> str:
+    """Return the demonstration bundles of one precision on their test flights."""
+    head = [
+        *("bundle", "median error", "rule", "scope", "coverage: tx ty tz, three rotations"),
+        *(
+            "all six",
+            "99 % band",
+            "median width",
+            "score",
+            "volume^(1/6)",
+            "classes; sets, frames in pieces",
+        ),
+    ]
+    rows: list[list[str]] = []
+    for method in METHODS:
+        report = read_result("demonstrations", demonstration(method, precision).name)
+        error = report["point_error"]
+        point = f"{100 * error['median_m']:.2f} cm {error['median_deg']:.2f} deg"
+        rows += [
+            [report["bundle"], point, part["rule"], scope, *_cells(level(part, scope))]
+            for part in (report, report["other_rule"])
+            for scope in ("marginal", "joint")
+        ]
+    return table(head, rows)
+
+
+def _cells(entry: Report) -> list[str]:
+    width, band = np.array(entry["median_width"]), entry["coverage_band"]
+    volume = entry.get("joint_volume")
+    pieces = "-"
+    if "set_size" in entry:
+        pieces = (
+            f"{np.mean(entry['set_size']):.1f}; {100 * np.mean(entry['disjoint_share']):.1f} %, "
+            f"{100 * entry['disjoint_frames']:.0f} %"
+        )
+    return [
+        " ".join(f"{value:.3f}" for value in entry["coverage"]),
+        f"{entry['joint_coverage']:.3f}",
+        "-" if band is None else f"{band[0]:.3f} to {band[1]:.3f}",
+        f"{100 * width[:3].mean():.2f} cm {np.rad2deg(width[3:].mean()):.2f} deg",
+        f"{entry['normalised_interval_score']:.3f}",
+        "-" if volume is None else f"{volume['geometric_mean'] ** (1 / 6):.3f}",
+        pieces,
+    ]
+
+
 def evaluation(name: str) -> str:
-    """Return the lines at 0.9 of one evaluation, FOLDER/NAME, as ``cvo-export evaluate`` prints."""
+    """Return one evaluation, FOLDER/NAME, as ``cvo-export evaluate`` prints it."""
     # Only here: it takes torch's start.
     from cvo_export.evaluate import table as printed
 
     folder, _, stem = name.partition("/")
-    report: Report = {"noise": None, **read_result(folder, stem), "own": None, "sequences": {}}
-    for part in (report, report.get("other_rule", {})):
-        if part:
-            part["levels"] = [entry for entry in part["levels"] if entry["confidence"] == 0.9]
-    return "\n".join(["```text", *(line.rstrip() for line in printed(report)), "```"])
+    return "\n".join(printed({"noise": None, **read_result(folder, stem)}))
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -237,6 +279,8 @@ TABLES: dict[str, Callable[[], str]] = {
         ("augmentation", "mcqr-dropout"),
     ),
     "members": partial(evaluations, ("paper-methods", "cjp"), ("members", "cjp-members")),
+    "demonstrations": partial(demonstrations, "fp32"),
+    "demonstrations-int8": partial(demonstrations, "int8"),
     "precisions": precisions,
     "shapes": shapes,
 }

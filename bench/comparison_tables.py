@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from markdown import table
+from markdown_table import table
 from networks import METHODS
 from provenance import read_result
 

@@ -1,4 +1,4 @@
-"""What a forest costs inside a CQR bundle: time, file size, memory at load.
+"""The cost of the forest inside a CQR bundle: time, file size, memory at load.
 
     python bench/forest_cost.py BUNDLE SOURCE [--frames 300] [--json FILE]
 
@@ -77,7 +77,7 @@ def main() -> None:
         for count, (image, tensor) in enumerate(
             islice(cycle(zip(images, tensors, strict=True)), arguments.frames + 20)
         ):
-            # The three take turns in the lead: whoever comes later finds warmer caches.
+            # The order rotates, because a later call finds warmer caches.
             calls = {
                 "whole": partial(whole.run, {"image": tensor}),
                 "without": partial(point.run, {"image": tensor}),

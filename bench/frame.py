@@ -1,12 +1,12 @@
-"""One frame: what a bundle costs beside its network, what uncertainty costs, what 8 bits save.
+"""One frame: the cost of a bundle beside its network, of uncertainty, and the gain of 8 bits.
 
     python bench/frame.py
 
-For every method, whole MobileNetV2 and ResNet34 at 224x224 and the demonstrations' network, in
-float32 and 8 bits, on frames of 640x480; CJP's networks also at 240x240, to which such frames are
-halved and nothing else. Two by two in turns: the bare call of onnxruntime on an input that is ready
-(``raw``), array to intervals (``step``), JPEG file to JSON record in a file (``record``), and the
-same network without what only intervals need, from array to pose (``pose_alone``).
+For every method: whole MobileNetV2 and ResNet34 at 224x224 and the demonstration network, in
+float32 and 8 bits, on frames of 640x480; CJP also at 240x240, which halving alone produces. Four
+calls are compared in pairs that take turns: onnxruntime on a prepared input (``raw``), array to
+interval (``step``), JPEG file to JSON record in a file (``record``), and array to pose with the
+outputs for intervals removed from the network (``pose_alone``).
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ PAIRS = (("record", "raw"), ("step", "pose_alone"), ("step", "raw"))
 
 
 class Timed:
-    """The calls on one bundle; ``conformal_ms`` is what follows the network in each ``step``.
+    """The calls on one bundle; ``conformal_ms`` is the time after the network in each ``step``.
 
-    An array is one that has just been written, as a camera or a decoder leaves it; so is the input
-    of the bare call. The same picture again, soon, would be a frozen camera's.
+    Each call gets an array that has just been written, as a camera or a decoder leaves it, and
+    always another picture: a repeated one would look like a frozen camera.
     """
 
     def __init__(self, bundle: Bundle, sink: Sink, scope: Scope = "marginal") -> None:
@@ -71,7 +71,7 @@ class Timed:
         }
 
     def before(self) -> dict[str, Callable[[int], object]]:
-        """Return what comes before each, untimed."""
+        """Return the untimed preparation of each call."""
         return {
             "raw": self.write_input,
             "step": self.write_image,
@@ -89,7 +89,7 @@ class Timed:
         self._feeds["image"] = self._input()
 
     def raw(self, _: int) -> None:
-        """Run the bare call, its threads where ours are."""
+        """Run the bare call on the threads of the odometer's session."""
         if self._odometer.session:
             self._odometer.session.run(self._feeds)
 
@@ -97,7 +97,7 @@ class Timed:
         """From an array to intervals."""
         estimate = self._odometer.step(self._image)
         if not estimate.bounded:
-            raise SystemExit(f"frame {number}: expected finite intervals, found none")
+            raise SystemExit(f"frame {number}: expected finite intervals, found unbounded ones")
         self.conformal_ms.append(estimate.latency_ms["conformal"])
 
     def record(self, _: int) -> None:
@@ -107,7 +107,7 @@ class Timed:
         self._sink.write(self._odometer.step(image, source=path.name))
 
     def pose_alone(self, _: int) -> None:
-        """From an array to the pose, without what only intervals need."""
+        """From an array to the pose, without the outputs for intervals."""
         self._alone.run({"image": self._input()})
 
     def _input(self) -> preprocess.Image:
@@ -118,9 +118,9 @@ class Timed:
 
 
 def measured(folder: Path, rounds: int, scope: Scope = "marginal") -> dict[str, Any]:
-    """Time one bundle: each two that are compared in turns, as a loop would run either.
+    """Time one bundle: the two calls of each pair take turns.
 
-    In blocks with sessions of their own: where a session's memory and threads happen to be shifts
+    Each block opens new sessions, because the placement of a session's memory and threads shifts
     all of its times.
     """
     found: dict[tuple[str, str], list[tuple[Array, Array]]] = {pair: [] for pair in PAIRS}
@@ -156,7 +156,7 @@ def measured(folder: Path, rounds: int, scope: Scope = "marginal") -> dict[str, 
 
 
 def precisions(folders: dict[str, Path], rounds: int) -> dict[str, Any]:
-    """Return how the bare calls of float32 and 8 bits compare, in turns."""
+    """Return float32 over 8 bits for the bare calls, which take turns."""
     with Sink(str(WORK / "records.jsonl"), "jsonl") as sink:
         timed = {name: Timed(read_bundle(folder), sink) for name, folder in folders.items()}
         ms = interleaved(

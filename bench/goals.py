@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from markdown import table
+from markdown_table import table
 from networks import METHODS
 from provenance import RESULTS, read_result, result_files
 
@@ -22,7 +22,7 @@ MOBILENET, RESNET = "mobilenetv2_100", "resnet34"
 
 @dataclass(frozen=True)
 class Goal:
-    """One line: what, a figure for each backbone, and the bound of each."""
+    """One line: a figure for each backbone and its bound."""
 
     what: str
     figure: Callable[[str], float | None]
@@ -47,7 +47,7 @@ class Goal:
 
 
 def report(name: str) -> dict[str, Any] | None:
-    """Return the results of one program, None where it has not been run."""
+    """Return the results of one program, None if it has not been run."""
     if not (RESULTS / "speed" / f"{name}.json").exists():
         return None
     results: dict[str, Any] = read_result("speed", name)["results"]

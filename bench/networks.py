@@ -1,10 +1,10 @@
-"""What is measured: bundles of whole networks, and frames, made from the synthetic room.
+"""Bundles of whole networks, and frames, made from the synthetic room for measurements.
 
     python bench/networks.py
 
-The networks have hardly been trained (100 steps of their heads, no pretrained weights): their time
-is that of trained ones, their poses are not. Everything is kept in ``build/bench``, where what is
-there is not made again. The trained ones are those in ``calibration_artifacts``.
+The networks are briefly trained (100 steps of their heads, no pretrained weights): they take the
+time of trained ones, but their poses are useless. Everything is kept in ``build/bench`` and reused.
+The trained bundles are those in ``calibration_artifacts``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PRECISIONS = ("fp32", "int8")
 ROOM = "synthetic:room,flights=20,frames=20"
 FRAMES = "synthetic:room,flights=1,frames=50,size=640x480,seed=1"
 _WHOLE = "--stages final --grid 1x1 --crop centre"
-# What halving alone makes of a frame of 640x480, cropped.
+# A cropped frame of 640x480, halved.
 HALVED = "240x240"
 _UNTRAINED = "--split random --steps 100 --copies 0"
 
@@ -44,7 +44,7 @@ def whole_bundle(
     size: str = "224x224",
     provider: str = "onnxruntime",
 ) -> Path:
-    """Return a bundle of a whole, hardly trained network, made now if it is not there."""
+    """Return a bundle of a whole, briefly trained network, made if it does not exist."""
     name = f"{method}-{backbone}" if size == "224x224" else f"{method}-{backbone}-{size}"
     options = f"--backbone {backbone} {_WHOLE} --size {size} --weights {_random_weights(backbone)}"
     run, bundle = WORK / "runs" / name, WORK / f"{name}-{precision}"
@@ -60,7 +60,7 @@ def whole_bundle(
 
 
 def _random_weights(backbone: str) -> Path:
-    """Return the file of a backbone's random weights, made now if it is not there."""
+    """Return the file of a backbone's random weights, made if it does not exist."""
     path = WORK / f"{backbone}-random.safetensors"
     if not path.exists():
         import timm
@@ -76,10 +76,10 @@ def _random_weights(backbone: str) -> Path:
 
 
 def open_branches(body: nn.Module) -> None:
-    """Give every branch of an untrained network that begins with a factor of zero one of one.
+    """Replace the scales of zero with which residual branches start by ones.
 
-    So do residual branches. An engine that folds constants would leave them out, and be timed on a
-    fraction of ResNet34; and 8 bits would have nothing to round.
+    Otherwise an engine that folds constants drops these branches and is timed on a fraction of
+    ResNet34, and 8 bits have nothing to round.
     """
     for name, values in body.named_parameters():
         if name.endswith("weight") and not values.any():
@@ -87,12 +87,12 @@ def open_branches(body: nn.Module) -> None:
 
 
 def demonstration(method: str, precision: str = "fp32") -> Path:
-    """Return the demonstration bundle of a method: a trained network that is cut short."""
+    """Return the demonstration bundle of a method: a trained, truncated network."""
     return ARTIFACTS / f"synthetic-room-{method}{'' if precision == 'fp32' else '-int8'}"
 
 
 def frames() -> list[Path]:
-    """Fifty JPEG files of 640x480 of a flight through the room, drawn now if not there."""
+    """Return fifty JPEG files, 640x480, of a flight through the room; rendered once."""
     folder = WORK / "frames"
     if not folder.exists():
         from cvo_export.datasets import open_dataset
@@ -112,7 +112,7 @@ def images() -> list[np.ndarray]:
 
 
 def pose_alone(model_bytes: bytes) -> bytes:
-    """Return the part of a model that gives the pose; what only the other outputs need is gone."""
+    """Return the part of a model that computes the pose."""
     extractor = Extractor(onnx.load_from_string(model_bytes))
     part: bytes = extractor.extract_model(["image"], ["pose"]).SerializeToString()
     return part

@@ -4,9 +4,9 @@
     python bench/peers.py
 
 Whole MobileNetV2 and ResNet34 at 224x224, one frame, two threads for each engine. Ours is timed
-from an array of 640x480 to intervals; a peer from an input that is ready to pose and bounds, which
-spares it the work around the network. Of peers that are not installed one line says so, and nobody
-is timed whose numbers are not ours.
+from an array of 640x480 to intervals; a peer from a prepared input to pose and bounds, without the
+work around the network. A peer that is not installed is reported in one line. A float32 peer whose
+outputs differ from ours is not timed.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from cvo_edge.odometer import Odometer
 from cvo_export.training.run import PoseGraph, load_run
 
 THREADS, ROUNDS, WARM_UP = 2, 40, 5
-# OpenMP's threads look for work for a fifth of a second after a call.
+# OpenMP's threads spin for a fifth of a second after a call.
 PAUSE_S, WARM_CALLS = 0.25, 3
-# Of a float32 peer's numbers from ours: in metres, radians and quaternion units, and in standard
-# deviations of that output over the images that are compared.
+# Largest difference of a float32 peer from ours: in metres, radians and quaternion units, and in
+# standard deviations of that output over the compared images.
 LARGEST_DIFFERENCE, LARGEST_SHARE = 1e-3, 0.1
-# Of what our own 8 bits change in the outputs: what another reduced precision may change.
+# How much more than our own 8 bits another reduced precision may change the outputs.
 LARGEST_ROUNDING = 5.0
 
 Outputs = list[NDArray[np.float32]]
@@ -43,7 +43,7 @@ Call = Callable[[preprocess.Image], Outputs]
 
 
 class Network:
-    """What the engines load: one backbone's CJP network in every form that one of them reads."""
+    """One backbone's CJP network in every form that an engine loads."""
 
     def __init__(self, backbone: str) -> None:
         self.backbone = backbone
@@ -67,7 +67,7 @@ class Network:
 
 
 class Normalised(torch.nn.Module):
-    """The network behind its normalisation, for engines that do not take 8-bit pixels."""
+    """The network after its normalisation, for engines that do not take 8-bit pixels."""
 
     def __init__(self, graph: PoseGraph) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ def model_input(image_bgr: preprocess.Image) -> preprocess.Image:
 
 
 def onnxruntime_defaults(network: Network, precision: str) -> Call:
-    """Load the graph with nothing but the number of threads."""
+    """Load the graph with default settings but for the number of threads."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = THREADS
     session = onnxruntime.InferenceSession(network.onnx(precision), options)
@@ -115,7 +115,7 @@ def torch_eager(network: Network) -> Call:
 
 
 def openvino(network: Network, precision: str, hint: str = "f32") -> Call:
-    """Compile our graph for the least latency, in the precision that is hinted."""
+    """Compile our graph for latency, with this inference precision as a hint."""
     import openvino as ov
 
     settings = {
@@ -136,7 +136,7 @@ def openvino(network: Network, precision: str, hint: str = "f32") -> Call:
 
 
 def openvino_own_choice() -> str:
-    """Return what OpenVINO computes float32 graphs in on this processor unless told otherwise."""
+    """Return the precision in which OpenVINO computes float32 graphs here by default."""
     import openvino as ov
 
     return str(ov.Core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name())
@@ -175,11 +175,11 @@ def ncnn(network: Network) -> Call:
 
         example = torch.zeros((1, 3, *network.frames[0].shape[1:3]))
         stem = network.converted / f"{network.backbone}.pt"
-        # Its default keeps weights in 16 bits.
+        # By default it keeps weights in 16 bits.
         pnnx.export(Normalised(network.graph), str(stem), (example,), fp16=False)
     net = engine.Net()
     net.opt.num_threads = THREADS
-    # Else weights and feature maps are rounded to 16 bits where the processor has them.
+    # Otherwise weights and feature maps are rounded to 16 bits on processors that support it.
     net.opt.use_fp16_packed = net.opt.use_fp16_storage = net.opt.use_fp16_arithmetic = False
     net.opt.use_bf16_storage = False
     net.load_param(str(path))
@@ -266,7 +266,7 @@ def measured(backbone: str, peers: dict[str, Peer]) -> dict[str, Any]:
             right = difference <= LARGEST_DIFFERENCE and share <= LARGEST_SHARE
         else:
             right = difference <= LARGEST_ROUNDING * rounding
-        # Written so that NaN is refused.
+        # In this form NaN is refused.
         if right:
             before[name], calls[name] = just_written(network.frames, call)
     spent = interleaved(

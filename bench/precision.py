@@ -1,9 +1,9 @@
-"""What 8 bits cost a trained run: coverage, width, error and size, beside float32.
+"""The cost of 8 bits for a trained run: coverage, width, error and size beside float32.
 
     python bench/precision.py RUN DATASET WORK [--json FILE]
 
 Publishes the run in both precisions into WORK, each calibrated on its own graph (rule pooled), and
-evaluates both on the run's test frames. What they save in time is in ``bench/frame.py``.
+evaluates both on the run's test frames. ``bench/frame.py`` measures their speed.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def main() -> None:
             publish(run, bundle, arguments.run.name, rule="pooled", precision=precision)
         found[precision] = figures(bundle, arguments.dataset)
     calibration = read_calibration(bundle)
-    # Of six degrees of freedom, whose units differ.
+    # A ratio for each of the six degrees of freedom, because their units differ.
     ratios = np.divide(found["int8"]["mean_width"], found["fp32"]["mean_width"])
     report = {
         "method": calibration.method,

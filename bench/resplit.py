@@ -1,12 +1,11 @@
-"""The sharp check of validity: heads fixed, calibration and test pooled, dealt anew many times.
+"""A sharp check of validity: fixed network, calibration and test frames split again many times.
 
     python bench/resplit.py BUNDLE DATASET [--resplits 200] [--json FILE]
 
-One split's coverage scatters by several percent around its expectation k/(n+1). Dealing the pooled
-frames into calibration and test again and again, with the network fixed, averages that away: what
-is left is whether scores, rank rule and sets are right. Every second deal is the mirror of the one
-before it (antithetic variates): what one half of the frames lends, the other gives back, so that
-200 deals scatter no more than some 1400 independent ones.
+The coverage of one split scatters by several percent around its expectation k/(n+1). Splitting the
+pooled calibration and test frames again many times, with the network fixed, averages this scatter
+away and shows whether scores, rank rule and sets are right. Every second split mirrors the previous
+one (antithetic variates), so that 200 splits scatter no more than some 1400 independent ones.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Measuring side by side: what is compared takes turns, and figures are of one run.
+"""Measuring side by side: calls that are compared take turns within one run.
 
-Machines change their speed from second to second. A ratio of two medians of separate runs shows
-that; a median of ratios within a round does not.
+The speed of a machine changes from second to second. That shows in a ratio of medians of separate
+runs, but not in a median of ratios within a round.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ def interleaved(
 ) -> dict[str, Array]:
     """Milliseconds of each call in each round, (rounds,); a call is given the round's number.
 
-    Who begins changes from round to round: whoever comes later finds warmer caches. With a
-    pause behind each call, threads that go on looking for work do not slow down the next one; after
-    it, and after a neighbour that fills every cache, untimed ``warm_calls`` make of the timed one
-    what it is in a loop. What is to be done ``before`` a call is not timed either.
+    The order rotates from round to round, because a later call finds warmer caches. A pause after
+    each call keeps its spinning threads from slowing down the next one. Untimed ``warm_calls``
+    restore the caches that the pause and the other calls have emptied. ``before`` holds untimed
+    preparations.
     """
     names = list(calls)
     spent = {name: np.empty(warmup + rounds) for name in names}
@@ -51,7 +51,7 @@ def interleaved(
 
 
 def in_turn(each: Sequence[T], number: int) -> list[T]:
-    """Return all of them, another one first in every round."""
+    """Return all of them, rotated so that each round begins with another one."""
     first = number % len(each)
     return [*each[first:], *each[:first]]
 
@@ -59,10 +59,10 @@ def in_turn(each: Sequence[T], number: int) -> list[T]:
 def just_written(
     inputs: Sequence[Array8], call: Callable[[Array8], object]
 ) -> tuple[Callable[[int], object], Callable[[int], object]]:
-    """Return what comes before a call, and the call, for ``interleaved``.
+    """Return the preparation of a call, and the call, for ``interleaved``.
 
-    One input a round, in their order, each just written into the same memory: as a camera or a
-    decoder leaves it, and not as it was when it was last looked at.
+    One input a round, in order, each just written into the same memory, as a camera or a decoder
+    leaves it.
     """
     kept = np.empty_like(inputs[0])
     return (
@@ -77,12 +77,12 @@ def figures(values: Array) -> dict[str, float]:
 
 
 def ratio(numerator: Array, denominator: Array) -> dict[str, float]:
-    """Return median and 95th percentile of what one round's times are to each other."""
+    """Return median and 95th percentile of the ratio within a round."""
     return figures(numerator / denominator)
 
 
 def write_report(name: str, results: Mapping[str, Any], **settings: object) -> None:
-    """Write ``results/speed/NAME.json``: figures, and all that a reader needs to judge them."""
+    """Write ``results/speed/NAME.json``: provenance, settings and figures."""
     write_result(RESULTS / "speed" / f"{name}.json", {"settings": settings, "results": results})
 
 

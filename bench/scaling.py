@@ -1,9 +1,9 @@
-"""How cost grows: with the input's size, confidences, J of MCQR, trees of CQR, K of CSP.
+"""How cost grows with input size, confidences, J of MCQR, trees of CQR and K of CSP.
 
     python bench/scaling.py
 
-Hardly trained networks of the default kind (MobileNetV2 cut at stride 16, 256x192), one setting
-changed at a time; ``uncertainty`` is array to intervals over the same network's array to pose.
+Briefly trained networks of the default kind (MobileNetV2 cut at stride 16, 256x192), one setting
+changed at a time; ``uncertainty`` is array to interval less array to pose of the same network.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from cvo_export.training.loop import train
 ROUNDS = 99
 SIZES = ("128x96", "256x192", "384x288", "512x384")
 CONFIDENCES = (5, 10, 50)
-# Method -> its option, values, and what the option decides.
+# Method -> its option and the option's values.
 OPTIONS: dict[str, tuple[str, tuple[int, ...]]] = {
     "mcqr": ("rays", (5, 21, 85, 192)),
     "cqr": ("trees", (10, 50, 100, 400)),
@@ -42,7 +42,7 @@ OPTIONS: dict[str, tuple[str, tuple[int, ...]]] = {
 
 
 def bundle(method: str, size: str = "256x192", **head: int) -> Path:
-    """Return a bundle with these options, made now if it is not there."""
+    """Return a bundle with these options, made if it does not exist."""
     name = "-".join([method, size, *(f"{key}{value}" for key, value in head.items())])
     folder = WORK / "scaling" / name
     if not folder.exists():
@@ -63,7 +63,7 @@ def bundle(method: str, size: str = "256x192", **head: int) -> Path:
             copies=0,
         )
         features = WORK / "features"
-        # One ellipsoid is enough for val here: what more of them cost is the question.
+        # Val would keep one ellipsoid here, but the cost of many is the question.
         with patch.object(mcqr, "thrifty_choice", whole_codebook):
             run = train(WORK / "runs" / name, config, lambda *_: None, features)
         publish(run, folder, name)
@@ -83,11 +83,11 @@ def one(folder: Path, scope: Scope = "marginal") -> dict[str, Any]:
 
 
 def confidences(count: int) -> dict[str, Any]:
-    """Time reading a bundle of so many confidences, and all their sets of both scopes."""
+    """Time reading a bundle of this many confidences, and all their sets in both scopes."""
     source = demonstration("cjp")
     content = read_bundle(source)
     stored = list(content.calibration.thresholds)
-    # Beside those that every bundle has; a larger confidence never has a smaller threshold.
+    # In addition to the standard ones; a larger confidence never has a smaller threshold.
     for scope in ("marginal", "joint"):
         least = min((t for t in stored if t.scope == scope), key=lambda t: t.confidence)
         levels = np.linspace(0.51, 0.79, count - len(LEVELS)).round(4).tolist()

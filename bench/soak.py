@@ -1,12 +1,12 @@
-"""A million frames, whether memory grows.
+"""Growth of memory over a million frames.
 
     python bench/soak.py [FRAMES]
 
-The demonstration's frames again and again, each time followed by a black and an unreadable one,
-through all that ``cvo-edge run`` consists of: odometer, records, summary, with ground truth.
+Repeats the frames of the demonstration clip, each time followed by a black and an unreadable one,
+through every part of ``cvo-edge run``: odometer, records, summary, ground truth.
 
-Memory is read a hundred times; growth is what the last tenth has more than the second, as the first
-fills buffers of a bounded size.
+Memory is read a hundred times. Growth is the last tenth's mean less that of the second tenth; the
+first tenth fills buffers of bounded size.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CLIP = ARTIFACTS / "synthetic-room-clip"
 
 
 class Cycled:
-    """Decoded frames of the clip and two faulty ones again and again, as a source."""
+    """A source that repeats the decoded frames of the clip and two faulty ones."""
 
     live = False
 
@@ -53,7 +53,7 @@ class Cycled:
             yield frame
 
     def reads(self) -> Iterator[Any]:
-        """Yield calls that give them."""
+        """Yield calls that return frames."""
         for frame in self:
             yield lambda frame=frame: frame
 

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from markdown import table
+from markdown_table import table
 from networks import BACKBONES
 from provenance import read_result
 

@@ -1,9 +1,9 @@
-"""Where the time beside the network goes: microseconds of each stage of a step.
+"""Microseconds of each stage of a step.
 
     python bench/stages.py
 
-The demonstrations' network on two threads, frames of 640x480 that have just been written; medians.
-Below them OpenCV's calls of the preprocessing, in a loop of their own.
+The demonstration network on two threads, frames of 640x480 that have just been written; medians.
+Then OpenCV's calls of the preprocessing, each in a loop of its own.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def main() -> None:
         "linear, exact": partial(
             cv2.resize, four, (256, 192), interpolation=cv2.INTER_LINEAR_EXACT
         ),
-        "linear, as it is": partial(cv2.resize, half, (256, 192), interpolation=cv2.INTER_LINEAR),
+        "linear, default": partial(cv2.resize, half, (256, 192), interpolation=cv2.INTER_LINEAR),
         "all of it": partial(preprocess.model_input, picture, 192, 256, "none"),
         "decode JPEG": partial(decode_image, content),
     }

@@ -1,12 +1,12 @@
-"""Starting: time to load, memory, and a fresh process until its first interval.
+"""Start: load time, memory, and the time from a fresh process to its first interval.
 
     python bench/start.py
 
-Every figure is of fresh processes, in turns: onnxruntime as it comes on the float32 model, with as
-many threads as ours and with one, beside which none spins; and ``Odometer.load`` with a warm cache
-of prepared models, in both precisions. Then whole processes: the smallest script of onnxruntime and
-OpenCV that gives a pose of one JPEG file, and ``cvo-edge run`` on the same file. Modules are
-compiled once, before, as an installation does it.
+Every figure comes from fresh processes that take turns: onnxruntime with default settings on the
+float32 model, with two threads and with one (a second thread spins); and ``Odometer.load`` with a
+warm model cache in both precisions. Then whole processes: the smallest script of onnxruntime and
+OpenCV that prints the pose of one JPEG file, and ``cvo-edge run`` on the same file. Modules are
+compiled beforehand, as an installation does.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rounds import Array, figures, in_turn, interleaved, ratio, write_report
 
 METHOD, THREADS, ROUNDS, WARM_UP = "cjp", 2, 15, 2
 
-# Both import what they need before the clock runs, and infer once before memory is read.
+# Both import their modules before the clock starts, and infer once before memory is read.
 PLAIN = """
 import json, sys
 from time import perf_counter
@@ -62,7 +62,7 @@ RUN = "from cvo_edge.__main__ import main; main()"
 
 
 def loaded(backbone: str) -> dict[str, Any]:
-    """Load times and anonymous memory of each, and their ratios to onnxruntime as it comes."""
+    """Load time and anonymous memory of each, and their ratios to default onnxruntime."""
     plain, int8 = (str(whole_bundle(METHOD, backbone, p)) for p in ("fp32", "int8"))
     commands = {
         "onnxruntime": [PLAIN, plain, str(THREADS)],
@@ -107,7 +107,7 @@ def first_interval(backbone: str) -> dict[str, Any]:
 
 def _run(arguments: list[str]) -> str:
     environment = {**os.environ, "CVO_EDGE_CACHE": str(WORK / "cache")}
-    # Where it is set, every process of a checkout would compile all modules anew.
+    # If it is set, every process compiles all modules of a checkout again.
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     command = [sys.executable, "-c", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)

@@ -1,11 +1,11 @@
-"""A stream of frames: how many a second, and what a steady camera costs.
+"""A stream of frames: throughput, and the processor time of a steady camera.
 
     python bench/stream.py
 
-Throughput: JPEG files to JSON records, by a script that does one thing after the other with
-onnxruntime as it comes (``naive``), and by ``Odometer.stream`` in each mode and precision, in
-turns. Camera: frames that come 30 times a second, processor time a frame of onnxruntime as it comes
-(the model alone, on an input that is ready) and of mode ``live``.
+Throughput: JPEG files to JSON records, by a sequential script on onnxruntime with default settings
+(``naive``) and by ``Odometer.stream`` in each mode and precision, in turns. Camera: 30 frames a
+second; processor time a frame of onnxruntime with default settings (the model alone, on a prepared
+input) and of mode ``live``.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ STEPS = 200
 BUSY = "while True: pass"
 
 
-def as_it_comes(bundle: Path, threads: int) -> onnxruntime.InferenceSession:
-    """Return a session of onnxruntime with nothing set but the number of threads."""
+def default_session(bundle: Path, threads: int) -> onnxruntime.InferenceSession:
+    """Return a session of onnxruntime with default settings but for the number of threads."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     return onnxruntime.InferenceSession(
@@ -51,7 +51,7 @@ def as_it_comes(bundle: Path, threads: int) -> onnxruntime.InferenceSession:
 
 
 def naive(engine: onnxruntime.InferenceSession, target: Path) -> Callable[[int], object]:
-    """Return a script's loop: read, resize, infer, write, one thing after the other."""
+    """Return a sequential loop: read, resize, infer, write."""
 
     def run(_: int) -> None:
         with target.open("w") as stream:
@@ -75,7 +75,7 @@ def streamed(odometer: Odometer, sink: Sink) -> Callable[[int], object]:
 
 
 class Recording:
-    """Pictures again and again with the stamps of a steady camera, as a source."""
+    """A source that repeats pictures with the stamps of a steady camera."""
 
     live = False
     length = FPS * SECONDS
@@ -89,20 +89,20 @@ class Recording:
             yield Frame(image, round(1e9 * number / FPS), "", 0.0)
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
-        """Yield calls that give them."""
+        """Yield calls that return frames."""
         for frame in self:
             yield lambda frame=frame: frame
 
 
 def throughput(backbone: str) -> dict[str, Any]:
-    """Time the whole folder by each, in turns; ratios are of the naive float32 script over each."""
+    """Time the whole folder, in turns; ratios are the naive float32 script over each."""
     with ExitStack() as stack:
         sink = stack.enter_context(Sink(str(WORK / "records.jsonl"), "jsonl"))
         plain = whole_bundle(METHOD, backbone)
         eight = whole_bundle(METHOD, backbone, "int8")
         calls = {
-            "naive": naive(as_it_comes(plain, THREADS), WORK / "naive.jsonl"),
-            "naive int8": naive(as_it_comes(eight, THREADS), WORK / "naive.jsonl"),
+            "naive": naive(default_session(plain, THREADS), WORK / "naive.jsonl"),
+            "naive int8": naive(default_session(eight, THREADS), WORK / "naive.jsonl"),
         }
         for precision in ("fp32", "int8"):
             for mode in ("latency", "throughput"):
@@ -122,7 +122,7 @@ def throughput(backbone: str) -> dict[str, Any]:
 
 
 def camera(backbone: str) -> dict[str, Any]:
-    """Processor time of a frame at 30 a second, in turns of some seconds; ages in ms."""
+    """Processor time a frame at 30 frames a second, in turns of some seconds; ages in ms."""
     count = FPS * SECONDS
     pictures = images()
     feeds = {"image": np.zeros((1, 224, 224, 3), np.uint8)}
@@ -142,7 +142,7 @@ def camera(backbone: str) -> dict[str, Any]:
 
     with ExitStack() as stack:
         calls: dict[str, Callable[[], list[float]]] = {}
-        calls["onnxruntime"] = paced(as_it_comes(whole_bundle(METHOD, backbone), THREADS))
+        calls["onnxruntime"] = paced(default_session(whole_bundle(METHOD, backbone), THREADS))
         for precision, threads in (("fp32", THREADS), ("int8", THREADS), ("int8", 1)):
             bundle = read_bundle(whole_bundle(METHOD, backbone, precision))
             odometer = Odometer(bundle, threads=threads, mode="live")
@@ -152,11 +152,11 @@ def camera(backbone: str) -> dict[str, Any]:
         skipped = dict.fromkeys(calls, 0)
         for number in range(CAMERA_ROUNDS):
             for name, call in in_turn(list(calls.items()), number):
-                # What spins after the one before has come to rest.
+                # Wait until the threads of the previous call have stopped spinning.
                 time.sleep(1.0)
                 begin = process_time()
                 found = call()
-                # A frame that was left out has cost nothing: it must not count.
+                # A dropped frame costs nothing and must not count.
                 cpu_ms[name].append(1e3 * (process_time() - begin) / (len(found) or count))
                 ages_ms[name] += found
                 skipped[name] += len(found) and count - len(found)
@@ -174,7 +174,7 @@ def camera(backbone: str) -> dict[str, Any]:
 
 
 def neighbour(backbone: str) -> dict[str, Any]:
-    """Milliseconds of a step where nothing else runs, and beside one process that never rests."""
+    """Milliseconds of a step alone, and beside one process that keeps a core busy."""
     found: dict[str, Any] = {}
     content = read_bundle(whole_bundle(METHOD, backbone))
     pictures = images()

@@ -7,7 +7,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from markdown import table
+from markdown_table import table
 from provenance import read_result
 
 Cell = dict[str, Any]

@@ -5,8 +5,8 @@
     python bench/tables.py NAME ...   # print tables; --list prints all names
 
 A table stands between two comments, ``<!-- table: NAME -->`` and ``<!-- end table -->``; what is
-between them is replaced. ``evaluation FOLDER/NAME`` is a name for every evaluation in the folders
-``paper-methods``, ``augmentation``, ``members`` and ``demonstrations``.
+between them is replaced. ``python bench/tables.py "evaluation FOLDER/NAME"`` prints one evaluation
+of ``paper-methods``, ``augmentation``, ``members`` or ``demonstrations`` with all confidences.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""What else gives a frame its uncertainty: MC-dropout of 30 passes, and five networks.
+"""Other sources of uncertainty: MC-dropout with 30 passes, and an ensemble of five networks.
 
     python bench/uncertainty_peers.py
 
-One frame of ours (CJP, an array of 640x480 to intervals) in turns with both, from the same array to
-mean and deviation, on onnxruntime with two threads in all. Each in every form that is fair to it;
-the fastest of those that run whole networks counts, the naive one and the one that computes the
-backbone once stand beside it. Weights are random: they do not change the time. Scores are those of
+One frame of ours (CJP, an array of 640x480 to intervals) takes turns with both, from the same array
+to mean and deviation, on onnxruntime with two threads in all. Each runs in several forms; the
+fastest form that runs whole networks counts, beside the naive form and the form that computes the
+backbone once. Weights are random, which does not change the time. Scores come from
 ``bench/results/compare``.
 """
 
@@ -41,7 +41,7 @@ from cvo_export.networks.standardised import PoseDecoder
 from cvo_export.training.run import PoseGraph, Run, load_run
 
 THREADS, ROUNDS, WARM_UP = 2, 30, 3
-# Threads of the naive forms look for work for milliseconds after a call.
+# Threads of the naive forms spin for milliseconds after a call.
 PAUSE_S, WARM_CALLS = 0.01, 1
 DROPOUT = 0.1
 NAIVE, SHARED = "naive", "one backbone"
@@ -51,7 +51,7 @@ Call = Callable[[preprocess.Image], Sequence[NDArray[np.float32]]]
 
 
 class RandomDropout(nn.Module):
-    """Dropout that stays on: of each pass, channels or units put to zero, drawn in the graph."""
+    """Dropout that stays on: each pass zeroes channels or units drawn in the graph."""
 
     def __init__(self, passes: int) -> None:
         super().__init__()
@@ -64,10 +64,10 @@ class RandomDropout(nn.Module):
 
 
 class DropoutGraph(nn.Module):
-    """A whole network with dropout behind every stage of the backbone and every hidden layer.
+    """A whole network with dropout after every stage of the backbone and every hidden layer.
 
-    As Kendall and Cipolla 2016 have it for camera poses; the first layers, before any dropout, are
-    computed once whatever the number of passes.
+    After Kendall and Cipolla 2016, for camera poses. The layers before the first dropout are
+    computed once for all passes.
     """
 
     def __init__(self, run: Run, passes: int) -> None:
@@ -89,7 +89,7 @@ class DropoutGraph(nn.Module):
 
 
 def random_backbone(run: Run) -> Backbone:
-    """Return a backbone as the run's with weights of its own."""
+    """Return a backbone of the run's kind with new random weights."""
     config = run.config
     backbone = Backbone(config.backbone, config.height, config.width)
     open_branches(backbone.body)
@@ -97,7 +97,7 @@ def random_backbone(run: Run) -> Backbone:
 
 
 def graphs(backbone: str) -> dict[str, bytes]:
-    """Export every network that is timed, by name, as ONNX files; kept beside the bundles."""
+    """Return every timed network as ONNX by name; the files are kept beside the bundles."""
     run = load_run(WORK / "runs" / f"cjp-{backbone}")
     setting = Setting(run.graph.backbone.size, run.target, 0)
 
@@ -130,7 +130,7 @@ def graphs(backbone: str) -> dict[str, bytes]:
 
 
 def merged(members: Sequence[bytes]) -> bytes:
-    """Return one graph of several under one input; its outputs are theirs, one after the other."""
+    """Return one graph of several networks with a common input and all their outputs."""
     whole, *others = (
         compose.add_prefix(onnx.load_from_string(content), f"{number}.", rename_inputs=False)
         for number, content in enumerate(members)
@@ -143,7 +143,7 @@ def merged(members: Sequence[bytes]) -> bytes:
 
 
 def plain(content: bytes) -> Call:
-    """Return a network on onnxruntime with nothing but the number of threads."""
+    """Return a network on onnxruntime with default settings but for the number of threads."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = THREADS
     session = onnxruntime.InferenceSession(content, options)
@@ -151,7 +151,7 @@ def plain(content: bytes) -> Call:
 
 
 def resting(content: bytes, threads: int = THREADS, outputs: str = "pose") -> Call:
-    """Return a network with our settings: its threads rest as soon as a call has ended."""
+    """Return a network with our settings: its threads do not spin between calls."""
     session = Session(content, threads).engine
     names = [spec.name for spec in session.get_outputs() if spec.name.endswith(outputs)]
     return lambda image: session.run(names, {"image": image})
@@ -202,12 +202,12 @@ def summary(call: Call, picture: preprocess.Image) -> tuple[Array, Array]:
 
 
 def check(kind: str, calls: dict[str, Call], picture: preprocess.Image) -> None:
-    """Refuse passes that are all alike, and forms of one ensemble that differ."""
+    """Refuse passes that are all equal, and forms of one ensemble that differ."""
     found = {name: summary(call, picture) for name, call in calls.items() if name != SHARED}
     expected, _ = found[NAIVE]
     for name, (mean, deviation) in found.items():
         if not deviation.any():
-            raise SystemExit(f"{kind}, {name}: expected answers that differ, found one")
+            raise SystemExit(f"{kind}, {name}: expected passes that differ, found equal ones")
         if kind == "ensemble" and not np.allclose(mean, expected, rtol=0.0, atol=1e-4):
             raise SystemExit(f"{kind}, {name}: expected {expected}, found {mean}")
 
@@ -250,7 +250,7 @@ def measured(backbone: str) -> dict[str, Any]:
 
 
 def scores() -> dict[str, dict[str, float]]:
-    """Median interval score over the seeds, by recording and method, as compared earlier."""
+    """Return the median interval score by recording and method, from the comparison."""
     found: dict[str, dict[str, float]] = {}
     for path in result_files("compare"):
         cells = read_result("compare", path.stem)["cells"]

@@ -82,4 +82,6 @@ def test_every_result_file_says_how_it_came_about():
             if path.name != "study.json":
                 found = json.loads(path.read_text("utf-8"))
                 itself = {"command", "date", "commit", "environment"} <= found.keys()
-                assert itself != (path.name in listed), path
+                assert itself != (path.name in listed), (
+                    f"{path}: drop or add its entry in study.json"
+                )
