@@ -4,13 +4,14 @@ PYTHON ?= python3
 TORCH_PIP_OPTIONS ?=
 VENV := .venv
 DEMO_VENV := .venv-demo
+DOCS_VENV := .venv-docs
 RELEASE_VENV := .venv-release
 LOWEST_VENV := .venv-lowest
 METHODS := cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 RUNTIME := $(shell find cvo_edge -type f -not -name "*.pyc")
 
-.PHONY: help demo test coverage check bench soak fuzz arm64 avx2 format clean
+.PHONY: help demo test coverage check docs bench soak fuzz arm64 avx2 format clean
 
 help: ## list all targets
 	@awk -F ':.*## ' '/^[a-z0-9 -]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -58,6 +59,15 @@ check: $(VENV)/.installed ## check lint, formatting, types and import rules
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
+$(DOCS_VENV)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(DOCS_VENV)
+	$(DOCS_VENV)/bin/python -m pip install --quiet --editable ".[docs]"
+	@touch $@
+
+docs: $(DOCS_VENV)/.installed ## build the documentation into build/site, strictly and without requests
+	NO_MKDOCS_2_WARNING=1 $(DOCS_VENV)/bin/mkdocs build --strict --quiet
+	@echo "build/site/index.html"
+
 # One after another: nothing may run during a measurement.
 bench: $(VENV)/.installed ## measure speed, memory and start-up against other engines; one hour on a quiet machine
 	$(VENV)/bin/python bench/networks.py
@@ -81,7 +91,7 @@ format: $(VENV)/.installed ## reformat the code
 	$(VENV)/bin/ruff format .
 
 clean: ## delete everything that these targets create
-	rm -rf $(VENV) $(DEMO_VENV) $(RELEASE_VENV) $(LOWEST_VENV) .opencv4 .boards build dist export/build
+	rm -rf $(VENV) $(DEMO_VENV) $(DOCS_VENV) $(RELEASE_VENV) $(LOWEST_VENV) .opencv4 .boards build dist export/build
 	rm -rf *.egg-info export/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	rm -f $(addprefix demo-,$(METHODS:=.png)) cvo-edge-demo.png
 

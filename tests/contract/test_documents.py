@@ -5,6 +5,7 @@ import re
 import signal
 from pathlib import Path
 
+import cvo_edge
 from cvo_edge import Reason, errors
 from fuzz.__main__ import FAULTS, KINDS
 
@@ -17,6 +18,15 @@ def test_every_program_has_its_results_and_no_figure_is_left_open() -> None:
     assert found == {*programs, "study"}
     for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")):
         assert not re.search(r"@[A-Z]+@", page.read_text("utf-8")), page
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    page = (ROOT / "docs" / "api" / "runtime.md").read_text("utf-8")
+    assert set(cvo_edge.__all__) <= set(re.findall(r"(?m)^::: cvo_edge\.(\w+)$", page))
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 150
 
 
 def test_every_reason_and_every_exit_code_is_explained() -> None:
