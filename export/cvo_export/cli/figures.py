@@ -1,0 +1,126 @@
+"""``cvo-export evaluate``, ``plot``, ``render``, ``dataset``: look at bundles and data sets."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cvo_edge.errors import UsageError
+from cvo_edge.files import write_text
+from cvo_edge.programs.cli import examples
+from cvo_edge.vocabulary import Scope
+from cvo_export.cli.app import DatasetArgument, app, opened
+from cvo_export.vocabulary import Subset
+
+
+@app.command(
+    epilog=examples(
+        "cvo-export evaluate bundles/redkitchen 7scenes:scenes/redkitchen",
+        "cvo-export evaluate bundles/redkitchen 7scenes:new-flights --subset all",
+        "cvo-export evaluate bundles/room synthetic:room --noise speckle:0.3",
+    )
+)
+def evaluate(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
+    dataset: DatasetArgument,
+    subset: Annotated[
+        Subset, typer.Option(help="The run's test frames, or all frames of unseen data.")
+    ] = "test",
+    noise: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME[:STRENGTH]",
+            help="Degrade the frames, e.g. speckle:0.3.",
+        ),
+    ] = None,
+    json_file: Annotated[
+        str | None, typer.Option("--json", help="Write the report as JSON to a file or -.")
+    ] = None,
+    min_coverage: Annotated[
+        float | None,
+        typer.Option(min=0, max=1, help="Exit 8 if any DoF covers less at 0.9 marginal."),
+    ] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of one inference.")] = None,
+) -> None:
+    """Measure coverage, width and error of a bundle on held-out frames.
+
+    With --noise, the frames are degraded; results are given for the bundle's own
+    thresholds and for thresholds of calibration frames with the same noise. NAME
+    is gaussian, salt-and-pepper, speckle, motion-blur, exposure or occlusion.
+    """
+    from cvo_export.data.noise import parse_noise
+    from cvo_export.evaluate import check_coverage, table
+    from cvo_export.evaluate import evaluate as evaluate_bundle
+
+    parsed = None if noise is None else parse_noise(noise)
+    report = evaluate_bundle(bundle, opened(dataset), subset, threads, parsed)
+    if json_file is not None:
+        write_text(json_file, json.dumps(report, indent=1) + "\n")
+    if json_file != "-":
+        print(*table(report), sep="\n")
+    if min_coverage is not None:
+        check_coverage(report, min_coverage)
+
+
+@app.command()
+def plot(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
+    dataset: DatasetArgument,
+    out: Annotated[Path, typer.Option(help="Picture to write, e.g. bands.png.")],
+    subset: Annotated[
+        Subset, typer.Option(help="The run's test frames, or all frames of unseen data.")
+    ] = "test",
+    sequence: Annotated[str | None, typer.Option(help="Only this sequence.")] = None,
+    confidence: Annotated[float, typer.Option(help="A confidence stored in the bundle.")] = 0.9,
+    scope: Annotated[
+        Scope,
+        typer.Option(help="Whether it holds for each degree of freedom or for all six at once."),
+    ] = "marginal",
+) -> None:
+    """Plot truth, point and bands of each degree of freedom, and x against y."""
+    from cvo_export.plot import plot as draw
+
+    draw(
+        bundle,
+        opened(dataset),
+        out,
+        subset=subset,
+        sequence=sequence,
+        confidence=confidence,
+        scope=scope,
+    )
+    print(out)
+
+
+@app.command()
+def render(
+    dataset: DatasetArgument,
+    folder: Annotated[Path, typer.Argument(help="New folder.", show_default=False)],
+    sequence: Annotated[str, typer.Option(help="Name of one sequence.")],
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Only the first frames, this many.")
+    ] = None,
+) -> None:
+    """Write one sequence as a 7-Scenes folder: JPEG images and .pose.txt."""
+    from cvo_export.datasets.seven_scenes import write_sequence
+
+    found = opened(dataset)
+    if sequence not in found.sequence_names:
+        raise UsageError(
+            f"sequence: expected one of {found.sequence_names[0]} to "
+            f"{found.sequence_names[-1]}, found {sequence}"
+        )
+    count = write_sequence(found, found.sequence_names.index(sequence), folder, frames)
+    print(f"{folder}: {count} frames of {sequence}")
+
+
+@app.command()
+def dataset(dataset: DatasetArgument) -> None:
+    """Describe a data set: frames, skipped frames and why, sequences, camera, extent."""
+    from cvo_export.datasets import open_dataset
+    from cvo_export.datasets.describe import describe
+
+    print(*describe(open_dataset(dataset)), sep="\n")
