@@ -14,17 +14,21 @@ from functools import partial
 from operator import index
 from pathlib import Path
 from threading import Event
-from time import perf_counter
 from typing import SupportsIndex, TypeVar
 
 from cvo_edge.errors import SourceError, UsageError, printable
-from cvo_edge.files import read_regular_file
 from cvo_edge.input.capture import TIMEOUT_S, Capture, Reader, shown
 from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
-from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image, is_image
+from cvo_edge.input.decoding import is_image
 from cvo_edge.input.frame import Frame, Source
+from cvo_edge.input.image_files import (
+    IMAGE_SUFFIXES,
+    ImageFiles,
+    colour_images,
+    images_in,
+    stamp_at,
+)
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 # Videos whose first bytes are those of an image.
 _JPEGS_IN_A_ROW = (".mjpg", ".mjpeg")
 
@@ -74,7 +78,7 @@ def open_source(
     except OSError as error:
         raise SourceError(f"{shown(text)}: not a usable name: {error.strerror}") from None
     if path.is_dir():
-        return ImageFiles(_images_in(path), fps, f"{path}: expected images, found none")
+        return ImageFiles(images_in(path), fps, f"{path}: expected images, found none")
     if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
         raise SourceError(f"{shown(text)}: expected a file's path, found a file address")
     if names_camera(text):
@@ -86,7 +90,7 @@ def open_source(
     if glob.has_magic(text):
         found = [Path(name) for name in glob.glob(text, recursive=True) if Path(name).is_file()]
         return ImageFiles(
-            _colour_images(found), fps, f"{shown(text)}: expected images, found no match"
+            colour_images(found), fps, f"{shown(text)}: expected images, found no match"
         )
     raise SourceError(
         f"{shown(text)}: not found; expected a folder, glob, video file, camera index, device or "
@@ -110,39 +114,6 @@ def names_camera(text: str) -> bool:
     if path.is_dir():
         return False
     return text.isdecimal() or path.is_char_device() or path.is_fifo() or "://" in text
-
-
-def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key that compares digits as numbers: ``frame-2`` before ``frame-10``."""
-    parts = re.split("([0-9]+)", str(path))
-    return [
-        (1, 0, part) if index % 2 == 0 else (0, int(part), "")
-        for index, part in enumerate(parts)
-        if part
-    ]
-
-
-class ImageFiles:
-    """Image files in the given order; an unreadable file is a frame without an image."""
-
-    live = False
-
-    def __init__(self, paths: list[Path], fps: float | None, if_empty: str) -> None:
-        if not paths:
-            raise SourceError(if_empty)
-        self._paths = paths
-        self._fps = fps
-        self.length: int | None = len(paths)
-
-    def reads(self) -> Iterator[Callable[[], Frame]]:
-        """Yield one call a file."""
-        for seq, path in enumerate(self._paths):
-            yield partial(_read_file, path, _stamp(seq, self._fps))
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield one frame a file."""
-        for read in self.reads():
-            yield read()
 
 
 class Video:
@@ -213,7 +184,7 @@ class _VideoStamps:
         """
         begin, self._seq = self._seq, self._seq + count
         if self._fps is not None:
-            return [_stamp(seq, self._fps) for seq in range(begin, self._seq)]
+            return [stamp_at(seq, self._fps) for seq in range(begin, self._seq)]
         if self._gap_ns is None:
             return [None] * count
         last_ns = self._last_ns
@@ -287,7 +258,7 @@ class Camera:
                     # An address of single pictures gives one frame per connection.
                     self._failures = 0
                 for frame in frames:
-                    stamp_ns = _stamp(seq, self._fps) if self._fps else frame.stamp_ns
+                    stamp_ns = stamp_at(seq, self._fps) if self._fps else frame.stamp_ns
                     yield replace(frame, stamp_ns=stamp_ns, source=f"{shown(self._device)}#{seq}")
                     seq += 1
         finally:
@@ -358,17 +329,6 @@ class Camera:
         return None
 
 
-def _read_file(path: Path, stamp_ns: int | None) -> Frame:
-    start = perf_counter()
-    try:
-        content = read_regular_file(path, MAX_IMAGE_BYTES, SourceError, links=True)
-        image = decode_image(content)
-    except SourceError:
-        image = None
-    spent = 1e3 * (perf_counter() - start)
-    return Frame(image, stamp_ns, shown(path.name), spent)
-
-
 def _itself(frame: Frame) -> Frame:
     return frame
 
@@ -382,21 +342,3 @@ def _is_one_image(path: Path) -> bool:
             return is_image(stream.read(16))
     except OSError:
         return False
-
-
-def _images_in(folder: Path) -> list[Path]:
-    # macOS leaves a hidden file beside each file on a card.
-    return _colour_images(
-        [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
-    )
-
-
-def _colour_images(paths: list[Path]) -> list[Path]:
-    images = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
-    images = [path for path in images if ".depth." not in path.name]
-    colour = [path for path in images if ".color." in path.name]
-    return sorted(colour or images, key=natural_key)
-
-
-def _stamp(seq: int, fps: float | None) -> int | None:
-    return None if fps is None else round(seq * 1_000_000_000 / fps)

@@ -13,6 +13,17 @@ import typer
 from cvo_edge.errors import GateError, SinkError, SourceError, UsageError
 from cvo_edge.files import write_text
 from cvo_edge.process import guarded, say
+from cvo_edge.programs.options import (
+    INTERVALS,
+    REPORT,
+    RUNTIME,
+    BundleArgument,
+    CacheOption,
+    JsonOption,
+    PublicKeyOption,
+    ThreadsOption,
+    examples,
+)
 from cvo_edge.vocabulary import Format, Mode, Scope
 
 if TYPE_CHECKING:
@@ -27,44 +38,6 @@ app = typer.Typer(
 
 # A thousand years of a camera; as many times as fit into memory.
 MOST_FRAMES, MOST_MEASURED = 10**12, 10**7
-
-_INTERVALS, _RUNTIME, _REPORT = "Intervals", "Runtime", "Output"
-
-
-def examples(*commands: str) -> str:
-    """Return the epilog that lists commands, one a line."""
-    return "\n\n".join(["Examples:", *commands])
-
-
-# readable: a file that cannot be read has an exit code of ours.
-BundleArgument = Annotated[
-    Path,
-    typer.Argument(
-        help="Folder with model.onnx and calibration.json.", readable=False, show_default=False
-    ),
-]
-ThreadsOption = Annotated[
-    int | None,
-    typer.Option(help="Cores to use; default: all allowed.", rich_help_panel=_RUNTIME),
-]
-CacheOption = Annotated[
-    bool,
-    typer.Option(
-        "--cache/--no-cache",
-        help="Keep an optimised copy of the model for later starts; see the command cache.",
-        rich_help_panel=_RUNTIME,
-    ),
-]
-PublicKeyOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="Accept only a bundle signed with this Ed25519 key (PEM).",
-        readable=False,
-        show_default=False,
-        rich_help_panel=_RUNTIME,
-    ),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @app.command("demo")
@@ -105,7 +78,7 @@ def run(
     ],
     output: Annotated[
         str,
-        typer.Option("-o", "--output", help="File, or - for stdout.", rich_help_panel=_REPORT),
+        typer.Option("-o", "--output", help="File, or - for stdout.", rich_help_panel=REPORT),
     ] = "-",
     format: Annotated[
         Format | None,
@@ -113,7 +86,7 @@ def run(
             help="Format of the records; default: by the file's suffix (.jsonl, .csv, .tum), else "
             "jsonl.",
             show_default=False,
-            rich_help_panel=_REPORT,
+            rich_help_panel=REPORT,
         ),
     ] = None,
     region: Annotated[
@@ -121,7 +94,7 @@ def run(
         typer.Option(
             "--region",
             help="Write the region's points into every record (mcqr, joint scope).",
-            rich_help_panel=_REPORT,
+            rich_help_panel=REPORT,
         ),
     ] = False,
     ground_truth: Annotated[
@@ -129,22 +102,22 @@ def run(
         typer.Option(
             help="TUM file or folder of .pose.txt; adds coverage to the summary.",
             readable=False,
-            rich_help_panel=_REPORT,
+            rich_help_panel=REPORT,
         ),
     ] = None,
     quiet: Annotated[
         bool,
-        typer.Option("--quiet", help="No progress or summary.", rich_help_panel=_REPORT),
+        typer.Option("--quiet", help="No progress or summary.", rich_help_panel=REPORT),
     ] = False,
     confidence: Annotated[
         float,
-        typer.Option(help="A confidence stored in the bundle.", rich_help_panel=_INTERVALS),
+        typer.Option(help="A confidence stored in the bundle.", rich_help_panel=INTERVALS),
     ] = 0.9,
     scope: Annotated[
         Scope,
         typer.Option(
             help="Whether it holds for each degree of freedom or for all six at once.",
-            rich_help_panel=_INTERVALS,
+            rich_help_panel=INTERVALS,
         ),
     ] = "marginal",
     fps: Annotated[
@@ -172,7 +145,7 @@ def run(
             "possible; throughput: most frames per second. Default: live for a camera, else "
             "latency.",
             show_default=False,
-            rich_help_panel=_RUNTIME,
+            rich_help_panel=RUNTIME,
         ),
     ] = None,
     threads: ThreadsOption = None,
@@ -262,7 +235,7 @@ def bench(
     json_file: Annotated[
         str | None,
         typer.Option(
-            "--json", help="Write the report as JSON to a file or -.", rich_help_panel=_REPORT
+            "--json", help="Write the report as JSON to a file or -.", rich_help_panel=REPORT
         ),
     ] = None,
     max_p95_ms: Annotated[

@@ -9,9 +9,9 @@ import torch
 from cvo_edge.errors import SinkError, UsageError
 from cvo_export.networks.standardised import MAX_SPREAD_RAD, fit_target
 from cvo_export.training import features
-from cvo_export.training import loop as training
 from cvo_export.training.features import ModelImages
 from cvo_export.training.loop import train
+from cvo_export.training.material import shared_folder
 from cvo_export.training.run import load_run
 
 from .conftest import ignore_progress, tiny_config
@@ -151,10 +151,10 @@ def test_too_few_frames_of_val_to_decide_anything_are_refused(tmp_path):
 
 def test_features_of_other_pixels_are_not_shared(tiny_run, tmp_path):
     images = ModelImages(tiny_run.dataset, np.arange(20), 48, 64, "none")
-    before = training._shared_folder(tmp_path, tiny_run.config, "w", images)
-    assert training._shared_folder(tmp_path, tiny_run.config, "w", images) == before
+    before = shared_folder(tmp_path, tiny_run.config, "w", images)
+    assert shared_folder(tmp_path, tiny_run.config, "w", images) == before
     images.images[3, 2, 1] ^= 1
-    assert training._shared_folder(tmp_path, tiny_run.config, "w", images) != before
+    assert shared_folder(tmp_path, tiny_run.config, "w", images) != before
 
 
 def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(tmp_path):

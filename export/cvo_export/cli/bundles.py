@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cvo_edge.programs.cli import examples
+from cvo_edge.programs.options import examples
 from cvo_edge.vocabulary import Crop, Precision, Provider, SplitKind
 from cvo_export.cli.app import (
     DatasetArgument,

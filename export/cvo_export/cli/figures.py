@@ -10,7 +10,7 @@ import typer
 
 from cvo_edge.errors import UsageError
 from cvo_edge.files import write_text
-from cvo_edge.programs.cli import examples
+from cvo_edge.programs.options import examples
 from cvo_edge.vocabulary import Scope
 from cvo_export.cli.app import DatasetArgument, app, opened
 from cvo_export.vocabulary import Subset

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import typer
 from typer.core import TyperCommand
 
-from cvo_edge.programs.cli import examples
+from cvo_edge.programs.options import examples
 from cvo_edge.vocabulary import Crop
 from cvo_export.cli.app import (
     DATA,

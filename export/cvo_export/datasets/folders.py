@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cvo_edge.errors import SourceError
-from cvo_edge.input.sources import natural_key
+from cvo_edge.input.image_files import natural_key
 from cvo_export.datasets.base import Intrinsics
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
 from cvo_edge.ground_truth import matrix_to_pose
-from cvo_edge.input.sources import natural_key
+from cvo_edge.input.image_files import natural_key
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.folders import only_world
 from cvo_export.datasets.frames import FrameList

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cvo_edge.input.sources import natural_key
+from cvo_edge.input.image_files import natural_key
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.folders import only_world
 from cvo_export.datasets.frames import FrameList

@@ -15,7 +15,7 @@ import numpy as np
 
 from cvo_edge.errors import SinkError, SourceError
 from cvo_edge.ground_truth import MATRIX_SUFFIX, read_pose_matrix
-from cvo_edge.input.sources import natural_key
+from cvo_edge.input.image_files import natural_key
 from cvo_edge.pose import Pose
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.frames import FrameList
