@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import msgspec
@@ -63,7 +64,7 @@ def demo(bundle: Path, picture: Path) -> None:
     expected = expected_coverage(digest)
     print("...", *summary.lines(), sep="\n")
     if expected:
-        print(f"expected    {expected}")
+        print(fill(expected, 80, initial_indent="expected    ", subsequent_indent=" " * 12))
     drawn = draw_run(
         estimates,
         [truth.pose_of(estimate) for estimate in estimates],
