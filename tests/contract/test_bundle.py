@@ -70,7 +70,8 @@ REFUSED = [
     (("name",), ..., "missing required field `name`"),
     (("extra",), 1, "unknown field `extra`"),
     (("model", "extra"), 1, "unknown field `extra`"),
-    (("method",), "magic", "method"),
+    (("method",), "", "method"),
+    (("method",), 3, "method"),
     (("model", "file"), "../model.onnx", "model.file"),
     (("model", "sha256"), "0" * 63, "model.sha256"),
     (("model", "opset"), 18.5, "model.opset"),
@@ -123,6 +124,14 @@ def test_a_wrong_value_names_the_key(document, path, value, rule):
     message = str(caught.value)
     assert rule in message.replace("$.", "").replace("`$.", "`")
     assert "\n" not in message
+
+
+def test_a_method_that_nobody_registered_is_refused_at_load(copied_bundle, document):
+    (copied_bundle / "calibration.json").write_bytes(
+        redigested(replaced(document, ("method",), "magic"))
+    )
+    with pytest.raises(CalibrationFileError, match="method: expected one of cjp, cqr, csp, mcqr"):
+        read_bundle(copied_bundle)
 
 
 METHOD_PARAMETERS = [

@@ -259,7 +259,8 @@ def test_processes_that_build_at_once_leave_one_whole_entry(bundle_dir, clip_dir
         )
         for _ in range(4)
     ]
-    poses = {json.loads(process.communicate()[0])["pose"]["t_m"][0] for process in running}
+    outputs = [process.communicate()[0].splitlines() for process in running]
+    poses = {json.loads(record)["pose"]["t_m"][0] for _, record in outputs}
     assert [process.returncode for process in running] == [0] * 4
     assert len(poses) == 1
     assert len(list(folder.iterdir())) == 1

@@ -135,7 +135,7 @@ def test_an_interrupted_run_ends_as_if_it_never_was(runs, tmp_path):
     _, run, _ = runs("mc-dropout")
     config = config_of("mc-dropout")
     with pytest.raises(InterruptedTrainingError):
-        train(tmp_path / "run", config, stopping_after(17, "mc-dropout"))
+        train(tmp_path / "run", config, stopping_after(17, "training"))
     resumed = train(tmp_path / "run", config, ignore_progress)
     assert same_weights(run, resumed)
     assert run.history == resumed.history

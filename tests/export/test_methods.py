@@ -87,7 +87,7 @@ def test_an_interrupted_run_ends_as_if_it_never_was(runs, method, tmp_path):
     # For CQR in the second of its four lessons, for MCQR in the last of its five.
     calls = {"cqr": 50, "csp": 25, "mcqr": 170}[method]
     with pytest.raises(InterruptedTrainingError):
-        train(tmp_path / "run", tiny_config(head=CONFIGS[method]), stopping_after(calls, method))
+        train(tmp_path / "run", tiny_config(head=CONFIGS[method]), stopping_after(calls, "training"))
     resumed = train(tmp_path / "run", tiny_config(head=CONFIGS[method]), ignore_progress)
     assert same_weights(run, resumed)
     assert run.history == resumed.history
@@ -403,10 +403,10 @@ def test_passes_are_rows_of_the_region_and_real_frames_are_what_is_counted(tmp_p
     seen = {}
     learn = training._Trainer.learn
 
-    def spy(self, name, build, rows=None, examples=None):
+    def spy(self, name, build, rows=None, examples=None, **more):
         if examples is not None:
             seen[name] = examples.x.shape, examples.val_x.shape
-        return learn(self, name, build, rows, examples)
+        return learn(self, name, build, rows, examples, **more)
 
     monkeypatch.setattr(training._Trainer, "learn", spy)
     head = McqrConfig(components=4, rays=8, augmentation="predictions", passes=3)

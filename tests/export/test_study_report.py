@@ -191,11 +191,11 @@ def test_table_one_compares_like_with_like(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("jointly", "sets"), [(True, "six at once, a region"), (False, "each degree of freedom")]
+    "sets", ["six at once, a region", "each degree of freedom", "whatever the method says"]
 )
-def test_a_method_that_is_registered_elsewhere_needs_no_change_here(jointly, sets, monkeypatch):
+def test_a_method_that_is_registered_elsewhere_needs_no_change_here(sets, monkeypatch):
     monkeypatch.setitem(TRAINABLE, "toy", SimpleNamespace(config=lambda: SimpleNamespace(knob=1)))
-    monkeypatch.setitem(HEADS, "toy", SimpleNamespace(one_joint_score=jointly))
+    monkeypatch.setitem(HEADS, "toy", SimpleNamespace(set_kind=sets))
     monkeypatch.setattr(tables, "read_calibration", lambda _: SimpleNamespace(method="toy"))
     made = Fabricated(methods=["toy"])
     main = made.add("methods", lambda p: cell("toy", p.seed, 1.0))

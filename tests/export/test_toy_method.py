@@ -75,7 +75,7 @@ def test_evaluate_has_its_figures_and_its_promise(bundle, tmp_path):
 
 
 def test_run_writes_its_intervals(bundle, tmp_path):
-    call(training.app, "render", DATASET, tmp_path / "clip", "--sequence", "flight-00")
+    call(training.app, "render", DATASET, tmp_path / "clip", "--sequence", "flight-01")
     call(runtime.app, "run", bundle, tmp_path / "clip", "-o", tmp_path / "out.jsonl", "--quiet")
     records = list(read_records(tmp_path / "out.jsonl"))
     assert len(records) == 40
