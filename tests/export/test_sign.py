@@ -241,7 +241,7 @@ def test_both_command_lines(copied_bundle, clip_dir, keys, tmp_path):
     signed = program("cvo-export", "sign", copied_bundle, "--key", secret, "--bundle-version", 3)
     assert signed.returncode == 0
     assert "version 3, signed with the key" in signed.stdout
-    assert len(program("cvo-edge", *run).stdout.splitlines()) == 2
+    assert len(program("cvo-edge", *run).stdout.splitlines()) == 1 + 2
     checked = program("cvo-edge", "verify", copied_bundle, "--public-key", public)
     assert (checked.returncode, checked.stderr) == (0, "")
     program("cvo-export", "sign", copied_bundle, "--key", secret, "--bundle-version", 2)
