@@ -1,14 +1,14 @@
 """How a stream of frames uses the cores: three modes, and the loops that run them.
 
-- ``latency``: one frame after the other, each as fast as all cores can make it.
-- ``throughput``: as many frames at a time as there are cores, each on one of them. Most frames a
-  second, but each frame takes longer. The order is kept; estimates arrive in bunches, which suits
-  recordings.
-- ``live``: the newest frame of a steady camera, with little processor time. No thread spins while
-  it waits, and frames that arrive during processing are dropped.
+- ``latency``: one frame at a time, on all cores.
+- ``throughput``: as many frames in parallel as there are cores, each on one core. This gives the
+  highest frame rate, but each frame takes longer. Estimates keep the order of the frames and arrive
+  in bursts, which suits recordings.
+- ``live``: the newest frame of a camera, with little processor time. Threads do not busy-wait, and
+  frames that arrive during processing are dropped.
 
-A loop takes frames, calls ``work`` on each (in threads of its own in ``throughput``), and yields
-the results in the order of the frames.
+Each loop calls ``work`` on every frame (in worker threads in ``throughput``) and yields the results
+in the order of the frames.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from cvo_edge.input.queue_lag import clock_s
 from cvo_edge.vocabulary import MODES, Mode
 
 Result = TypeVar("Result")
-# A frame and its number in the stream -> what is made of it.
+# A frame and its number in the stream -> the result for it.
 Work = Callable[[Frame, int], Result]
 
-# Frames queued behind those in work, so that one slow frame does not leave cores idle.
+# Frames queued behind those being processed, so that a slow frame leaves no core idle.
 AHEAD = 2
-# How long a stream that ends waits for a frame that is on its way.
+# How long a stream waits for a pending read when it ends.
 _PATIENCE_S = 2.0
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Settings of a mode: threads of one inference, whether they spin, frames at a time."""
+    """Settings of a mode: threads per inference, whether they spin, frames in parallel."""
 
     threads: int
     spinning: bool
@@ -54,9 +54,9 @@ class Plan:
 
 
 def plan(mode: Mode, threads: int | None = None) -> Plan:
-    """Return the settings of a mode for ``threads`` in all, by default one for each allowed core.
+    """Return the settings of a mode for ``threads`` in total, by default one per allowed core.
 
-    Raises UsageError for a number of threads that is out of range.
+    Raises UsageError if the number of threads is out of range.
     """
     threads = checked_threads(threads)
     if mode == "throughput":
@@ -65,7 +65,7 @@ def plan(mode: Mode, threads: int | None = None) -> Plan:
 
 
 def checked_mode(mode: str) -> Mode:
-    """Return the mode of that name; raises UsageError where there is none."""
+    """Return the mode of that name; raises UsageError if it is unknown."""
     for known in MODES:
         if known == mode:
             return known
@@ -79,23 +79,23 @@ def run_stream(
     work: Work[Result],
     next_seq: Callable[[], int],
 ) -> Generator[Result, None, None]:
-    """Yield what ``work`` makes of each frame, in the order of the frames.
+    """Yield the result of ``work`` for each frame, in the order of the frames.
 
     Parameters
     ----------
     frames
-        A source, or frames or bare images, whose memory may be reused once the next is asked for.
+        A source, or frames or bare images, whose memory may be reused after the next request.
     mode, workers
-        The mode, and the number of frames at a time in ``throughput``.
+        The mode, and the number of frames in parallel in ``throughput``.
     work
         Called with each frame and its number.
     next_seq
-        Number of the next frame that nobody has been given yet.
+        Returns the number of the next frame.
 
-    Raises what the source and ``work`` raise, in its place after the results before it, and in
-    ``live`` UsageError for a recording without stamps.
+    Raises errors of the source and of ``work`` after the results of earlier frames, and in ``live``
+    UsageError for a recording without stamps.
     """
-    # The frames of a camera have to be taken as they come: those that nobody takes grow old.
+    # A camera must be read continuously; frames left in its queue become stale.
     if mode == "live" or (isinstance(frames, Source) and frames.live):
         with closing(_newest(frames)) as newest:
             yield from _one_by_one(newest, work, next_seq)
@@ -111,7 +111,7 @@ def run_stream(
 def _newest(frames: Iterable[Frame | NDArray[Any]]) -> Generator[Frame, None, None]:
     if isinstance(frames, Source):
         coming = frames if frames.live else Played(frames)
-        # A source that somebody else wrote need not have it.
+        # A user-defined source may have no stop method.
         return iter(Newest(coming, getattr(coming, "stop", None)))
     return iter(Newest(map(_kept, frames)))
 
@@ -132,7 +132,7 @@ def _as_frame(frame: Frame | NDArray[Any]) -> Frame:
 
 
 def _kept(frame: Frame | NDArray[Any]) -> Frame:
-    """Copy a caller's image, as the caller may write the next one into the same memory."""
+    """Copy the caller's image, because the caller may reuse its memory."""
     given = _as_frame(frame)
     image = given.image
     return replace(given, image=image.copy() if isinstance(image, np.ndarray) else image)
@@ -144,10 +144,10 @@ def _already_read(frame: Frame | NDArray[Any]) -> Callable[[], Frame]:
 
 
 def in_order(tasks: Iterable[Callable[[], Result]], workers: int) -> Generator[Result, None, None]:
-    """Run tasks in ``workers`` threads and yield what they return, in their order.
+    """Run tasks in ``workers`` threads and yield their results in order.
 
-    Tasks are taken as they are needed: never more than a few are under way. What a task raises, or
-    a source of tasks that ends early, is raised in its place, after the results before it.
+    Tasks are fetched on demand, so only a few are pending at a time. An error of a task, or of the
+    iterable itself, is raised after the results of the tasks before it.
     """
     pending: deque[Future[Result]] = deque()
     pool = ThreadPoolExecutor(workers, "cvo-edge worker")
@@ -159,12 +159,12 @@ def in_order(tasks: Iterable[Callable[[], Result]], workers: int) -> Generator[R
         while pending:
             yield pending.popleft().result()
     finally:
-        # Whoever leaves does not wait for what is being read.
+        # Do not wait for reads in progress.
         pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _failing_last(tasks: Iterable[Callable[[], Result]]) -> Iterator[Callable[[], Result]]:
-    """Tasks, and where their source ends with an error one more that raises it."""
+    """Yield the tasks and, if their iterable fails, a final task that raises its error."""
     try:
         yield from tasks
     except Exception as error:  # noqa: BLE001 - raised in its place
@@ -177,10 +177,10 @@ def _failing_last(tasks: Iterable[Callable[[], Result]]) -> Iterator[Callable[[]
 
 
 class Newest:
-    """The newest frame of a source, which does not wait for whoever looks at it.
+    """Yield the newest frame of a source that keeps running while frames are processed.
 
-    A thread reads on; frames that were not looked at before the next one came are left out, and
-    counted in ``Frame.skipped``. ``stop`` ends the source's wait for its next frame.
+    A thread reads continuously. Frames that a newer one replaces before they are requested are
+    dropped and counted in ``Frame.skipped``. ``stop`` ends the source's wait for its next frame.
     """
 
     def __init__(self, frames: Iterable[Frame], stop: Callable[[], None] | None = None) -> None:
@@ -194,8 +194,8 @@ class Newest:
         self._failure: BaseException | None = None
 
     def __iter__(self) -> Generator[Frame, None, None]:
-        """Yield frames until the source ends; raises what it raised, after its last frame."""
-        # A camera may never give another frame: nothing waits for ever for who waits for it.
+        """Yield frames until the source ends; raises the source's error after its last frame."""
+        # A daemon thread, because a camera may never deliver another frame.
         reader = Thread(target=self._read, name=READER, daemon=True)
         reader.start()
         try:
@@ -212,7 +212,7 @@ class Newest:
             self._closed = True
             if self._stop is not None:
                 self._stop()
-            # A thread that Python ends inside OpenCV takes the process with it.
+            # If Python ends a thread inside OpenCV, the process crashes.
             reader.join(_PATIENCE_S)
         if self._failure is not None:
             raise self._failure
@@ -226,7 +226,7 @@ class Newest:
                     self._changed.notify()
                 if self._closed:
                     return
-        except BaseException as error:  # noqa: BLE001 - raised by whoever iterates
+        except BaseException as error:  # noqa: BLE001 - raised in the iterating thread
             self._failure = error
         finally:
             with self._changed:
@@ -235,7 +235,7 @@ class Newest:
 
 
 class Played:
-    """A recording at the times of its stamps, as a camera would give it; late frames at once.
+    """Play a recording by its stamps, like a camera; late frames are yielded immediately.
 
     Raises UsageError for a frame without a stamp.
     """
@@ -245,12 +245,12 @@ class Played:
         self._stopped = Event()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames, each at its time, until ``stop``."""
+        """Yield each frame at its time, until ``stop`` is called."""
         begin = None
         for frame in self._source:
             if frame.stamp_ns is None:
                 raise UsageError(
-                    "live: expected a camera, or frames with stamps (--fps), found none"
+                    "live: expected a camera or frames with stamps, found no stamp; give --fps"
                 )
             if begin is None:
                 begin = perf_counter() - 1e-9 * frame.stamp_ns
@@ -260,5 +260,5 @@ class Played:
             yield frame
 
     def stop(self) -> None:
-        """End the play, whoever is waiting for its next frame."""
+        """End playback, even while another thread waits for the next frame."""
         self._stopped.set()
