@@ -98,8 +98,8 @@ _HOMES = {
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - a name of any type
     """Import a public name on first use.
 
-    The command line sets the environment of numpy and OpenCV first and answers ``--version``
-    without importing either.
+    This lets the command line set environment variables before numpy and OpenCV are imported, and
+    answer ``--version`` without importing them.
     """
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

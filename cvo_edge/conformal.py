@@ -1,6 +1,6 @@
 """Split conformal prediction: the rank rule, the joint score, coverage, width, interval score.
 
-Every formula that turns scores into a threshold or sets into a figure is here, once.
+This module holds every formula that turns scores into thresholds or sets into figures.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from cvo_edge.errors import UsageError
 
 Array = NDArray[np.float64]
 
-# Absorbs the rounding of products like 20 * 0.95, which must count as exactly 19.
+# Absorbs rounding errors of products such as 20 * 0.95, which must count as exactly 19.
 _RANK_TOLERANCE = 1e-9
 
-# The joint scope compares degrees of freedom by this quantile of their scores on val.
+# The joint scope scales degrees of freedom by this quantile of their scores on val.
 _SCALE_LEVEL = 0.9
 _LEAST_SCALE = 1e-6
 
 
 def conformal_rank(n: int, confidence: float) -> int:
-    """Rank k = ceil((n + 1) * confidence): the k-th smallest of n scores is the threshold."""
+    """Return k = ceil((n + 1) * confidence): the k-th smallest of n scores is the threshold."""
     if not 0.0 < confidence < 1.0:
         raise UsageError(f"confidence: expected a number between 0 and 1, found {confidence}")
     return max(1, math.ceil((n + 1) * confidence - _RANK_TOLERANCE))
 
 
 def conformal_quantile(scores: ArrayLike, confidence: float) -> float:
-    """q_hat of one-dimensional scores (n,): the k-th smallest, infinite where k > n.
+    """Return q_hat of scores (n,): the k-th smallest, or infinity if k > n.
 
     For exchangeable scores P(new score <= q_hat) >= confidence, and <= confidence + 1/(n + 1)
-    without ties (Vovk et al. 2005; Angelopoulos and Bates 2021, section 1). With k > n no finite
-    threshold has that property: the maximum would claim what is not there.
+    without ties (Vovk et al. 2005; Angelopoulos and Bates 2021, section 1). If k > n, no finite
+    threshold has this property, not even the maximum of the scores.
 
     Raises UsageError for NaN scores.
     """
@@ -48,11 +48,12 @@ def conformal_quantile(scores: ArrayLike, confidence: float) -> float:
 
 
 def hierarchical_quantile(scores: ArrayLike, sequence: ArrayLike, confidence: float) -> float:
-    """q_hat for a *new* sequence, from scores (n,) grouped by ``sequence`` (n,).
+    """Return q_hat for a *new* sequence, from scores (n,) grouped by ``sequence`` (n,).
 
-    The confidence quantile of sum_g sum_i delta(s_gi) / ((G + 1) n_g) + delta(inf) / (G + 1)
-    (Lee, Barber and Willett 2023, arXiv 2306.06342): sequences are exchangeable, frames within
-    one need not be. Finite only where G / (G + 1) >= confidence (G >= 9 at 0.9).
+    The result is the ``confidence`` quantile of
+    sum_g sum_i delta(s_gi) / ((G + 1) n_g) + delta(inf) / (G + 1)
+    (Lee, Barber and Willett 2023, arXiv 2306.06342): sequences are exchangeable, frames within one
+    need not be. It is finite only if G / (G + 1) >= confidence (G >= 9 at 0.9).
 
     Raises UsageError for NaN scores.
     """
@@ -66,28 +67,28 @@ def hierarchical_quantile(scores: ArrayLike, sequence: ArrayLike, confidence: fl
 
 
 class JointScale(Protocol):
-    """Makes the scores of different degrees of freedom (and sides) comparable, and goes back.
+    """Map scores of different degrees of freedom (and sides) to a comparable scale, and back.
 
-    Chosen on data other than the calibration set, so that the largest comparable score of a frame
-    is one exchangeable score; the threshold of each column is then its way back from one q_hat, and
-    all columns hold together.
+    The scale is fitted on data other than the calibration set, so that a frame's largest comparable
+    score is exchangeable. Mapping the q_hat of that score back gives one threshold per column, and
+    all columns hold jointly.
     """
 
     def comparable(self, scores: Array) -> Array:
         """Scores (n, sides, 6) -> comparable scores of the same shape, increasing in each."""
 
     def thresholds(self, q_hat: float) -> Array:
-        """One threshold on comparable scores -> one for each side and DoF, (sides, 6)."""
+        """One threshold on comparable scores -> thresholds per side and DoF, (sides, 6)."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearScale:
-    """s / m with positive scales m (sides, 6): for scores without bound, such as residuals."""
+    """s / m with positive scales m (sides, 6), for unbounded scores such as residuals."""
 
     scales: Array
 
     def __post_init__(self) -> None:
-        """Refuse scales that are not positive with a UsageError."""
+        """Raise UsageError for scales that are not positive."""
         if not (self.scales > 0).all():
             raise UsageError(
                 f"joint scales: expected positive numbers, found {self.scales.tolist()}"
@@ -95,7 +96,7 @@ class LinearScale:
 
     @classmethod
     def fitted(cls, scores: Array) -> LinearScale:
-        """Scale by the 90 % quantile of |score| in scores (n, sides, 6), at least 1e-6."""
+        """Use the 90 % quantile of |score| over scores (n, sides, 6), at least 1e-6, as scales."""
         scales = np.quantile(np.abs(scores), _SCALE_LEVEL, axis=0)
         return cls(np.asarray(np.maximum(scales, _LEAST_SCALE)))
 
@@ -110,17 +111,17 @@ class LinearScale:
 
 @dataclass(frozen=True, eq=False)
 class RankScale:
-    """The share of scores below, for scores that fill [0, ``top``], such as class scores.
+    """The share of smaller scores, for scores in [0, ``top``] such as class scores.
 
-    Per column the strictly increasing piecewise linear map through (0, 0), (v_(i), i/(m + 1)) and
-    (top, 1), of slope 1 above; v are the scores of m other frames, ascending.
+    Each column has a strictly increasing, piecewise linear map through (0, 0), (v_(i), i/(m + 1))
+    and (top, 1), with slope 1 above; v are the ascending scores of m other frames.
     """
 
     knots: tuple[tuple[tuple[Array, Array], ...], ...]
 
     @classmethod
     def fitted(cls, scores: Array, top: float) -> RankScale:
-        """Take the knots from scores (m, sides, 6); infinite ones only count."""
+        """Compute the knots from scores (m, sides, 6); infinite scores only count towards m."""
         columns = [[_rank_knots(column, top) for column in side.T] for side in _by_side(scores)]
         return cls(tuple(tuple(side) for side in columns))
 
@@ -134,7 +135,7 @@ class RankScale:
         return np.asarray(np.moveaxis(np.array(mapped), -1, 0))
 
     def thresholds(self, q_hat: float) -> Array:
-        """As ``JointScale``; a hair larger, so that no rounding on the way excludes a score."""
+        """As ``JointScale``, slightly enlarged, so that rounding excludes no score."""
         back = [[_piecewise(np.array(q_hat), r, v) for v, r in row] for row in self.knots]
         return np.asarray(np.array(back) + 1e-12)
 
@@ -146,7 +147,7 @@ def _by_side(scores: Array) -> list[Array]:
 def _rank_knots(column: Array, top: float) -> tuple[Array, Array]:
     """Scores (m,) of one column -> positions and ranks of the knots, both strictly increasing."""
     finite = np.sort(column[np.isfinite(column)])
-    # Of equal scores the last has the rank.
+    # Equal scores share the rank of the last one.
     last = np.append(finite[1:] > finite[:-1], True) if finite.size else np.empty(0, bool)
     ranks = (np.arange(finite.size) + 1.0) / (column.size + 1.0)
     inner = last & (finite > 0.0) & (finite < top)
@@ -157,26 +158,26 @@ def _rank_knots(column: Array, top: float) -> tuple[Array, Array]:
 
 
 def _piecewise(values: Array, x: Array, y: Array) -> Array:
-    """Piecewise linear through (x, y), with slope 1 outside the knots; infinity stays."""
+    """Interpolate linearly through (x, y), with slope 1 outside the knots; keeps infinity."""
     inside = np.interp(values, x, y)
     return np.asarray(inside + np.minimum(values - x[0], 0.0) + np.maximum(values - x[-1], 0.0))
 
 
 def interval_score(width: ArrayLike, distance: ArrayLike, alpha: float) -> Array:
-    """Winkler's score of sets (Gneiting and Raftery 2007, eq. 43); smaller is better.
+    """Return the Winkler score of sets (Gneiting and Raftery 2007, eq. 43); smaller is better.
 
-    Width (any shape; for a union of bands its measure) plus 2/alpha times the distance of the truth
-    to the set (same shape, 0 inside); the result has their shape and unit.
+    The score is the width (any shape; the total length for a union of bands) plus 2/alpha times the
+    distance from the truth to the set (same shape, 0 inside), in the same unit.
     """
     return np.asarray(width, np.float64) + (2.0 / alpha) * np.asarray(distance, np.float64)
 
 
 def effective_sample_size(scores: ArrayLike) -> float:
-    """How many independent draws scores (n,) in time order are worth: n / (1 + 2 sum rho_k).
+    """Return the effective sample size of scores (n,) in time order: n / (1 + 2 sum rho_k).
 
     rho_k is the autocorrelation at lag k; the sum ends before the first pair of lags (2m, 2m + 1)
-    whose correlations add up to no more than zero (initial positive sequence, Geyer 1992). Never
-    more than n.
+    whose correlations sum to zero or less (initial positive sequence, Geyer 1992). The result is at
+    most n.
     """
     s = _checked(scores)
     n = s.size
@@ -193,7 +194,7 @@ def effective_sample_size(scores: ArrayLike) -> float:
         if pair <= 0.0:
             break
         pairs += pair
-    # The first pair holds rho_0 = 1, which counts once.
+    # The first pair includes rho_0 = 1, which counts only once.
     return float(n / max(1.0, 2.0 * pairs - 1.0))
 
 
@@ -203,5 +204,5 @@ def _checked(scores: ArrayLike) -> Array:
         raise UsageError(f"scores: expected one dimension, found shape {values.shape}")
     if np.isnan(values).any():
         count = int(np.isnan(values).sum())
-        raise UsageError(f"scores: expected numbers, found {count} NaN among {values.size}")
+        raise UsageError(f"scores: expected no NaN, found {count} NaN among {values.size}")
     return values

@@ -1,17 +1,17 @@
-"""Everything that can go wrong, one exit code each.
+"""All errors of the package, each with its exit code.
 
 ::
 
-    CvoError                     1   a defect of ours, never raised as such
-    |-- UsageError               2   the caller asked for what cannot be
+    CvoError                     1   base class, never raised itself; 1 also means a defect
+    |-- UsageError               2   an invalid parameter, option or call
     |-- CalibrationFileError     3   calibration.json missing, malformed, unknown version
     |-- ModelError               4   model.onnx missing, refused or failing
     |-- BundleMismatchError      5   model and calibration do not belong together
-    |-- SourceError              6   source or data set cannot be read or ended early
+    |-- SourceError              6   source or data set cannot be read, or ended early
     |-- SinkError                7   output cannot be written
     +-- GateError                8   a gate failed: latency, memory, coverage, parity, self-test
 
-Every message is one line that says what was expected, what was found, and where.
+Every message is one line that says what was expected, what was found and where.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ _LONGEST = 1000
 
 
 class CvoError(Exception):
-    """Base of every error this package raises on purpose.
+    """Base class of all errors that this package raises deliberately.
 
     Attributes
     ----------
     exit_code
-        What both command lines return to the shell for this class.
+        Exit code of both command lines for this class.
     """
 
     exit_code: ClassVar[int] = 1
 
     def __init__(self, message: str) -> None:
-        # What was found may be a megabyte in one line.
+        # The message may quote a line of a megabyte.
         super().__init__(message if len(message) <= _LONGEST else f"{message[: _LONGEST - 3]}...")
 
 
 def printable(text: str) -> str:
-    """Return a text as one line that does nothing to a terminal, whatever a path in it holds."""
+    """Return a text as one line without control characters, e.g. from a path."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 class UsageError(CvoError):
-    """A parameter, option or call that cannot be served, e.g. a confidence that is not stored."""
+    """A parameter, option or call is invalid, e.g. a confidence that the bundle does not store."""
 
     exit_code = 2
 
@@ -67,7 +67,7 @@ class BundleMismatchError(CvoError):
 
 
 class SourceError(CvoError):
-    """Images or poses cannot be read, ended early, or there are none."""
+    """Images or poses are missing, cannot be read, or ended early."""
 
     exit_code = 6
 
@@ -79,6 +79,6 @@ class SinkError(CvoError):
 
 
 class GateError(CvoError):
-    """A limit that the caller set, or a check of ours, was not met."""
+    """A limit set by the caller, or a built-in check, was not met."""
 
     exit_code = 8

@@ -1,4 +1,4 @@
-"""What the odometer returns for one frame: status, pose and the set that holds the true pose."""
+"""The odometer's result for one frame: status, pose and the set that holds the true pose."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BandsOrUnbounded = tuple[tuple[tuple[float | None, float | None], ...], ...]
 
 
 class Status(StrEnum):
-    """What a frame's estimate is worth."""
+    """Validity of a frame's estimate."""
 
     OK = "ok"
     DEGRADED = "degraded"
@@ -35,21 +35,23 @@ class Status(StrEnum):
 
 
 class Reason(StrEnum):
-    """The closed list of remarks on a frame; the comment says which status each one goes with."""
+    """All remarks on a frame; the comments give the status that goes with each of them."""
 
-    IMAGE_UNREADABLE = "image_unreadable"  # invalid: the file or stream gave no whole image
+    IMAGE_UNREADABLE = "image_unreadable"  # invalid: the file or stream gave no complete image
     IMAGE_UNSUPPORTED = "image_unsupported"  # invalid: not a 2-D or 3-channel 8- or 16-bit image
     OUTPUT_NOT_FINITE = "output_not_finite"  # invalid: the network gave NaN or infinity
-    OUTPUT_ABSURD = "output_absurd"  # invalid: the network gave numbers of no sensible size
+    OUTPUT_ABSURD = "output_absurd"  # invalid: the network gave implausibly large numbers
     POSE_IMPLAUSIBLE = "pose_implausible"  # invalid: outside the bundle's pose limits
-    IMAGE_BLACK = "image_black"  # degraded: hardly any light, as behind a lens cap
-    IMAGE_SATURATED = "image_saturated"  # degraded: more than half of it is white
-    IMAGE_FLAT = "image_flat"  # degraded: of one colour, without contrast
+    IMAGE_BLACK = "image_black"  # degraded: almost no light, e.g. a lens cap
+    IMAGE_SATURATED = "image_saturated"  # degraded: more than half of the image is white
+    IMAGE_FLAT = "image_flat"  # degraded: one colour, no contrast
     IMAGE_SIZE_CHANGED = "image_size_changed"  # degraded: not the size of the stream's first frame
-    FRAME_REPEATED = "frame_repeated"  # degraded: an image that was there before, as if frozen
-    FRAME_STALE = "frame_stale"  # degraded: it waited for more than a second
-    STAMP_NOT_LATER = "stamp_not_later"  # degraded: not after the stamp of the frame before
-    BOUNDS_CROSSED = "bounds_crossed"  # ok: a negative correction emptied a set; its middle stands
+    FRAME_REPEATED = "frame_repeated"  # degraded: the same image came before; it may be frozen
+    FRAME_STALE = "frame_stale"  # degraded: the frame waited for more than a second
+    STAMP_NOT_LATER = "stamp_not_later"  # degraded: not later than the previous frame's stamp
+    BOUNDS_CROSSED = (
+        "bounds_crossed"  # ok: a negative correction emptied a set; it is now its midpoint
+    )
     PITCH_NEAR_90 = "pitch_near_90"  # ok: |pitch| > 80 deg, roll and yaw are ill-defined
 
 
@@ -75,8 +77,8 @@ class RecordedRegion(_Strict, frozen=True):
 class RecordedInterval(_Strict, frozen=True):
     """The conformal set in the chart ``rotation``, m and rad; None (null) is unbounded.
 
-    ``bands`` are given per DoF for methods whose sets may be in pieces. ``region`` is UNSET (no
-    such key) unless the run was asked for regions, and None where the region is unbounded.
+    ``bands`` holds intervals per DoF for methods whose sets may have gaps. ``region`` is UNSET (no
+    key) unless regions were requested, and None if there is no region or it is unbounded.
     """
 
     confidence: float
@@ -90,7 +92,7 @@ class RecordedInterval(_Strict, frozen=True):
 
 
 class Record(_Strict, frozen=True):
-    """What is written about one frame: one JSON line, one row of CSV, one line of the table."""
+    """The output for one frame: one JSON line, one CSV row or one line of the table."""
 
     seq: int
     stamp_ns: int | None
@@ -109,20 +111,20 @@ class PoseInterval:
     Attributes
     ----------
     seq, stamp_ns, source
-        Number of the frame in its stream, time in integer nanoseconds (None where the source gives
-        none) and the source's name for it.
+        Number of the frame in its stream, time in integer nanoseconds (None if the source gives no
+        time) and the source's name for the frame.
     status, reasons
-        ``ok``; ``degraded`` (a pose, but nothing may be claimed: all bounds infinite); ``invalid``
-        (no pose either). Remarks from the closed list ``Reason``.
+        ``ok``, ``degraded`` (a pose without a guarantee: all bounds are infinite) or ``invalid``
+        (no pose); remarks from ``Reason``.
     pose
-        The point estimate, None where invalid.
+        The point estimate; None if the status is ``invalid``.
     conformal_set
-        The conformal set; everything (infinite) unless the status is ``ok``.
+        The conformal set; unbounded unless the status is ``ok``.
     confidence, scope
         The stated probability, and whether it holds for each DoF (``marginal``) or for all six at
         once (``joint``).
     chart
-        What the six numbers mean.
+        Meaning of the six numbers.
     latency_ms
         Milliseconds per stage: read, preprocess, model, conformal, total.
     """
@@ -146,19 +148,19 @@ class PoseInterval:
 
     @property
     def upper(self) -> Array:
-        """Shape (6,), as ``lower``; +inf where unbounded."""
+        """Shape (6,), in the order of ``lower``; +inf where unbounded."""
         return self.conformal_set.upper
 
     @property
     def bands(self) -> Bands | None:
-        """Disjoint intervals per DoF, or None where the set is its hull."""
+        """Disjoint intervals per DoF, or None if the set equals its hull."""
         return self.conformal_set.bands
 
     def position_boxes(self) -> Array:
-        """Shape (boxes, 3, 2): the set of the position, as disjoint boxes [low, high], metres.
+        """Return the position's set as disjoint boxes [low, high], metres, shape (boxes, 3, 2).
 
-        The product of the bands of tx, ty and tz; a single box for a method without gaps. With the
-        joint scope the true position lies in one of them with the stated probability.
+        The boxes are the product of the bands of tx, ty and tz; a set without gaps gives one box.
+        In the joint scope the true position lies in one of them with the stated probability.
         """
         bands = self.bands or tuple(
             ((low, high),) for low, high in zip(self.lower, self.upper, strict=True)
@@ -171,44 +173,44 @@ class PoseInterval:
         return bool(np.isfinite(self.lower).all() and np.isfinite(self.upper).all())
 
     def covers(self, pose: Pose | ArrayLike) -> NDArray[np.bool_]:
-        """Say per DoF, shape (6,), whether the set holds a ``T_world_camera`` (Pose or shape (7,)).
+        """Tell per DoF, (6,), whether the set holds a ``T_world_camera`` (Pose or shape (7,)).
 
-        Raises UsageError for an invalid frame: there is no set to ask.
+        Raises UsageError for an invalid frame, which has no set.
         """
         return self.conformal_set.covers(self._coordinates(pose))
 
     def contains(self, pose: Pose | ArrayLike) -> bool:
         """Whether the set holds this pose in all six degrees of freedom at once.
 
-        In the joint scope of MCQR that is the region itself, which is smaller than its hull; else
-        whether ``covers`` is true of all six, and the errors are its.
+        In the joint scope of MCQR the test uses the region, which is smaller than its hull;
+        otherwise all six values of ``covers`` must be true. Raises as ``covers``.
         """
         return self.conformal_set.contains(self._coordinates(pose))
 
     def _coordinates(self, pose: Pose | ArrayLike) -> Array:
         if self.pose is None:
-            raise UsageError(f"frame {self.seq} is invalid: it has no set that could hold a pose")
+            raise UsageError(f"frame {self.seq} is invalid: it has no pose and no set")
         other = pose if isinstance(pose, Pose) else Pose.from_array(pose)
         return self.chart.coordinates(other.to_array(), self.pose.to_array())
 
     def covariance(self) -> Array:
-        """Shape (6, 6), diagonal: (half-width / z)^2 in m^2 and rad^2, infinite where unbounded.
+        """Return a diagonal matrix (6, 6): (half-width / z)^2 in m^2 and rad^2, may be infinite.
 
-        z is the normal quantile of the marginal confidence. A convention for filters that want a
-        covariance; the guarantee is that of the interval alone.
+        z is the normal quantile of the stated confidence. This is a convention for filters that
+        need a covariance; the guarantee holds only for the set.
         """
-        # Not for every start: it brings in fractions and decimals.
+        # Imported here because it also loads fractions and decimal, which few programs need.
         from statistics import NormalDist
 
         z = NormalDist().inv_cdf(0.5 + 0.5 * self.confidence)
         return np.diag(((self.upper - self.lower) / (2.0 * z)) ** 2)
 
     def to_record(self, *, region: bool = False) -> Record:
-        """The record of this frame, with ``interval.region`` set on request."""
+        """Return the record of this frame, with ``interval.region`` on request."""
         pose, interval = None, None
         if self.pose is not None:
             lower, upper = tuple(self.lower.tolist()), tuple(self.upper.tolist())
-            # As ``bounded``, which takes longer for twelve numbers that are lists already.
+            # Equal to ``self.bounded``, but faster on twelve Python floats.
             bounded, bands = all(map(math.isfinite, lower + upper)), self.bands
             pose = RecordedPose(tuple(self.pose.t_m.tolist()), tuple(self.pose.q_xyzw.tolist()))
             interval = RecordedInterval(
@@ -233,7 +235,7 @@ class PoseInterval:
         )
 
     def to_dict(self, *, region: bool = False) -> dict[str, Any]:
-        """The record as ``json.loads`` returns its JSON line: dicts, lists, strings, numbers."""
+        """Return the record as ``json.loads`` reads it: dicts, lists, strings and numbers."""
         decoded: dict[str, Any] = msgspec.json.decode(
             msgspec.json.encode(self.to_record(region=region))
         )
@@ -256,12 +258,12 @@ class PoseInterval:
         return f"{line}, {cm} cm, {deg} deg ({self.confidence:g} {self.scope})"
 
     def __repr__(self) -> str:
-        """The same line, marked as an object."""
+        """Return the line of ``str`` in angle brackets."""
         return f"<PoseInterval {self}>"
 
     def _repr_html_(self) -> str:
-        """Small table for notebooks: lower and upper bound of each degree of freedom."""
-        # Only notebooks need it.
+        """Return a table for notebooks: lower and upper bound of each degree of freedom."""
+        # Imported here because only notebooks need it.
         from html import escape
 
         name = f"frame {self.seq} {printable(self.source)}".rstrip()

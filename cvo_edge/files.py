@@ -1,4 +1,4 @@
-"""Read files from outside within bounds, write files whole or not at all, find our own folders."""
+"""Bounded reading of untrusted files, atomic writing, and the folders for cache and state."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from cvo_edge.errors import CvoError, SinkError, UsageError
 def regular_file(
     path: Path, limit: int, error: type[CvoError], *, links: bool = False
 ) -> io.BufferedReader:
-    """Open a regular file of at most ``limit`` bytes; else raise the error.
+    """Open a regular file of at most ``limit`` bytes; raises ``error`` for anything else.
 
-    Links are followed where ``links`` says so. Nothing else is opened, or waited for.
+    Symbolic links are followed only if ``links`` is set. Never blocks on pipes or devices.
     """
-    # O_NONBLOCK: opening a FIFO that nobody writes to must not hang before fstat refuses it.
+    # O_NONBLOCK: opening a FIFO without a writer must not block before fstat refuses it.
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
     if not links:
         flags |= getattr(os, "O_NOFOLLOW", 0)
     try:
         descriptor = os.open(path, flags)
     except FileNotFoundError:
-        raise error(f"{path}: expected a file, found none") from None
+        raise error(f"{path}: no such file") from None
     except OSError as failure:
-        raise error(f"{path}: expected a readable regular file: {failure.strerror}") from None
+        raise error(f"{path}: cannot be opened as a regular file: {failure.strerror}") from None
     stream = os.fdopen(descriptor, "rb")
     found = os.fstat(descriptor)
     if stat.S_ISREG(found.st_mode) and found.st_size <= limit:
@@ -38,16 +38,16 @@ def regular_file(
     stream.close()
     if stat.S_ISREG(found.st_mode):
         raise error(f"{path}: expected at most {limit} bytes, found {found.st_size}")
-    raise error(f"{path}: expected a regular file, found another kind")
+    raise error(f"{path}: not a regular file")
 
 
 def read_regular_file(
     path: Path, limit: int, error: type[CvoError], *, links: bool = False
 ) -> bytes:
-    """All bytes of a regular file, as ``regular_file`` opens it."""
+    """Return all bytes of a regular file; parameters and errors as for ``regular_file``."""
     with regular_file(path, limit, error, links=links) as stream:
         try:
-            # Room for as much as it had is made faster than for as much as it may have.
+            # Allocating the file's present size is faster than allocating the limit.
             size = min(os.fstat(stream.fileno()).st_size, limit)
             content = stream.read(size + 1)
             if len(content) > size:
@@ -55,7 +55,7 @@ def read_regular_file(
         except OSError as failure:
             raise error(f"{path}: cannot be read: {failure.strerror}") from None
         except MemoryError:
-            raise error(f"{path}: expected memory for all of it, found none") from None
+            raise error(f"{path}: not enough memory to read the file") from None
     if len(content) > limit:
         raise error(f"{path}: expected at most {limit} bytes, found more")
     return content
@@ -65,16 +65,17 @@ def read_regular_file(
 def whole_file(
     path: Path, *, durable: bool = False, make_folder: bool = False
 ) -> Iterator[BinaryIO]:
-    """Yield a stream whose content becomes the file once the block ends; nothing remains otherwise.
+    """Yield a stream whose content becomes the file when the block ends without an error.
 
-    Readers see the old file or the whole new one. A link at ``path`` is replaced, not followed.
+    Readers see either the old or the complete new file. A link at ``path`` is replaced, not
+    followed.
 
     Parameters
     ----------
     durable
-        Flush the file and its folder to the disk, so that the same holds after a loss of power.
+        Flush the file and its folder to the disk, so that this also holds after a power loss.
     make_folder
-        Create the folder and its parents where they are missing.
+        Create the folder and its parents if they are missing.
 
     Raises
     ------
@@ -101,7 +102,7 @@ def whole_file(
     except BaseException as error:
         with suppress(OSError):
             unfinished.unlink(missing_ok=True)
-        # torch.save turns a failed write into a RuntimeError of its own.
+        # torch.save raises a RuntimeError if a write fails.
         cause = error if isinstance(error, OSError) else error.__context__
         if isinstance(error, Exception) and isinstance(cause, OSError):
             raise _unwritable(path, cause) from None
@@ -131,7 +132,7 @@ def write_whole(
 def write_text(target: str, text: str) -> None:
     """Write text to a file, or to standard output for ``-``; raises SinkError.
 
-    A regular file is replaced whole; a pipe, a device or a link is written to.
+    A regular file is replaced atomically; pipes, devices and links are written to directly.
     """
     if target == "-":
         sys.stdout.write(text)
@@ -147,16 +148,17 @@ def write_text(target: str, text: str) -> None:
 
 
 def own_folder(variable: str, base_variable: str, base: str) -> Path:
-    """Return the folder that a variable names, else ``cvo-edge`` in the user's own of that kind.
+    """Return the folder that a variable names, or else ``cvo-edge`` in an XDG base folder.
 
     Parameters
     ----------
     variable
-        Ours, e.g. ``CVO_EDGE_CACHE``.
+        This project's environment variable, e.g. ``CVO_EDGE_CACHE``.
     base_variable, base
-        That of the XDG specification, e.g. ``XDG_CACHE_HOME``, and what it stands for if not set.
+        Variable of the XDG specification, e.g. ``XDG_CACHE_HOME``, and the default if it is unset.
 
-    Raises UsageError for a relative path in ``variable``: it would mean another folder everywhere.
+    Raises UsageError if ``variable`` holds a relative path, whose meaning would depend on the
+    current folder.
     """
     named = os.environ.get(variable)
     if named:
@@ -169,5 +171,5 @@ def own_folder(variable: str, base_variable: str, base: str) -> Path:
     try:
         return Path(base).expanduser() / "cvo-edge"
     except RuntimeError:
-        # A user without a home: a folder that cannot be made.
+        # The user has no home folder: return a path that cannot be created.
         return Path(os.devnull) / "cvo-edge"

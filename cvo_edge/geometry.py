@@ -1,9 +1,9 @@
 """Rotations on arrays: SO(3) and unit quaternions, batched over leading axes.
 
 Quaternions are scalar-last (qx qy qz qw), unit, with qw >= 0. A rotation vector is axis times
-angle, radians, norm at most pi. Euler angles are intrinsic Z-Y-X, given as roll, pitch, yaw:
-``R = Rz(yaw) @ Ry(pitch) @ Rx(roll)``. Nothing here knows which reference frames are meant: names
-like ``R_a_b`` say it at the call.
+angle in radians, with norm at most pi. Euler angles are intrinsic Z-Y-X, given as roll, pitch, yaw:
+``R = Rz(yaw) @ Ry(pitch) @ Rx(roll)``. The functions are independent of reference frames; callers
+state them in names such as ``R_a_b``.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ _SMALL_ANGLE = 1e-8
 
 
 def wrap_angle(angle: ArrayLike) -> Array:
-    """Angles (any shape, rad) moved by multiples of 2 pi into [-pi, pi]."""
+    """Wrap angles (any shape, rad) into [-pi, pi]."""
     values = np.asarray(angle, dtype=np.float64)
     return np.asarray(values - 2.0 * np.pi * np.round(values / (2.0 * np.pi)))
 
 
 def quaternion_normalise(q_xyzw: ArrayLike) -> Array:
-    """Shape (..., 4) -> unit quaternions with qw >= 0, the same rotation.
+    """Quaternions (..., 4) -> unit quaternions with qw >= 0 for the same rotation.
 
-    A zero or non-finite quaternion gives NaN: it is no rotation.
+    A zero or non-finite quaternion, which is not a rotation, gives NaN.
     """
     q = np.asarray(q_xyzw, dtype=np.float64)
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
@@ -35,7 +35,7 @@ def quaternion_normalise(q_xyzw: ArrayLike) -> Array:
 
 
 def quaternion_multiply(p_xyzw: ArrayLike, q_xyzw: ArrayLike) -> Array:
-    """Hamilton product of shape (..., 4) quaternions: the rotation q followed by p."""
+    """Return the Hamilton product of quaternions (..., 4): the rotation q followed by p."""
     px, py, pz, pw = np.moveaxis(np.asarray(p_xyzw, dtype=np.float64), -1, 0)
     qx, qy, qz, qw = np.moveaxis(np.asarray(q_xyzw, dtype=np.float64), -1, 0)
     return np.stack(
@@ -50,7 +50,7 @@ def quaternion_multiply(p_xyzw: ArrayLike, q_xyzw: ArrayLike) -> Array:
 
 
 def quaternion_conjugate(q_xyzw: ArrayLike) -> Array:
-    """The inverse rotation of unit quaternions, shape (..., 4)."""
+    """Return the inverse rotations of unit quaternions (..., 4)."""
     return np.asarray(np.multiply(q_xyzw, (-1.0, -1.0, -1.0, 1.0), dtype=np.float64))
 
 
@@ -58,7 +58,7 @@ def quaternion_exp(rotvec: ArrayLike) -> Array:
     """Rotation vectors (..., 3), rad -> unit quaternions (..., 4), qw >= 0."""
     v = np.asarray(rotvec, dtype=np.float64)
     angle = np.linalg.norm(v, axis=-1, keepdims=True)
-    # sinc keeps full precision through zero: sin(a/2)/a = 0.5 * sinc(a / (2 pi)).
+    # sinc keeps full precision near zero: sin(a/2)/a = 0.5 * sinc(a / (2 pi)).
     xyz = 0.5 * np.sinc(angle / (2.0 * np.pi)) * v
     return quaternion_normalise(np.concatenate([xyz, np.cos(0.5 * angle)], axis=-1))
 
@@ -87,8 +87,7 @@ def quaternion_to_matrix(q_xyzw: ArrayLike) -> Array:
 def matrix_to_quaternion(R: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) -> unit quaternions (..., 4), qw >= 0.
 
-    The largest of the four components is found first and the others divided by it (Shepperd
-    1978), so that no rotation is near a singularity.
+    Dividing by the largest of the four components (Shepperd 1978) avoids singularities.
     """
     m = np.asarray(R, dtype=np.float64)
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -112,7 +111,7 @@ def matrix_to_quaternion(R: ArrayLike) -> Array:
 def matrix_to_euler_zyx(R: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) -> roll, pitch, yaw (..., 3), rad.
 
-    Within about 1e-6 rad of pitch = +-pi/2 roll and yaw are not separate: roll is set to 0.
+    Within about 1e-6 rad of pitch = +-pi/2, roll and yaw are not unique and roll is set to 0.
     """
     m = np.asarray(R, dtype=np.float64)
     horizontal = np.hypot(m[..., 0, 0], m[..., 1, 0])
@@ -144,7 +143,7 @@ def euler_zyx_to_quaternion(euler: ArrayLike) -> Array:
 
 
 def nearest_rotation(M: ArrayLike) -> Array:
-    """The rotation matrices nearest to M (..., 3, 3) in the Frobenius norm (polar, by SVD)."""
+    """Return the rotations nearest to M (..., 3, 3) in the Frobenius norm (polar, by SVD)."""
     u, _, vt = np.linalg.svd(np.asarray(M, dtype=np.float64))
     sign = np.ones((*u.shape[:-2], 3))
     sign[..., 2] = np.sign(np.linalg.det(u @ vt))
@@ -152,10 +151,10 @@ def nearest_rotation(M: ArrayLike) -> Array:
 
 
 def mean_rotation(q_xyzw: ArrayLike) -> Array:
-    """Mean of unit quaternions (n, 4) in the chordal metric, shape (4,).
+    """Return the mean (4,) of unit quaternions (n, 4) in the chordal metric.
 
-    The eigenvector of the largest eigenvalue of ``sum q q^T`` (Markley et al. 2007); it does not
-    care about the sign of each quaternion.
+    The mean is the eigenvector of the largest eigenvalue of ``sum q q^T`` (Markley et al. 2007); it
+    does not depend on the sign of each quaternion.
     """
     q: Array = np.asarray(q_xyzw, dtype=np.float64)
     _, vectors = np.linalg.eigh(q.T @ q)

@@ -18,17 +18,17 @@ Array = NDArray[np.float64]
 
 MATRIX_SUFFIX = ".pose.txt"
 
-# Frames are matched to the nearest ground-truth stamp within this bound, that of the TUM tools.
+# Frames match the nearest ground-truth stamp within this bound, as in the TUM tools.
 MAX_STAMP_DIFFERENCE_NS = 20_000_000
 
 _MAX_BYTES, _MAX_MATRIX_BYTES = 256 << 20, 1 << 16
 
 
 def read_pose_matrix(path: Path) -> Array | None:
-    """Read a 4x4 camera-to-world matrix in metres -> pose (7,), or None where it is no pose.
+    """Read a 4x4 camera-to-world matrix in metres -> pose (7,), or None if it is invalid.
 
-    What is no text of 16 numbers, or no pose by ``matrix_to_pose``, is none: tracking was lost
-    there.
+    Recordings mark lost tracking by files without 16 numbers or with an invalid matrix (see
+    ``matrix_to_pose``).
     """
     try:
         content = read_regular_file(path, _MAX_MATRIX_BYTES, SourceError, links=True)
@@ -39,10 +39,10 @@ def read_pose_matrix(path: Path) -> Array | None:
 
 
 def matrix_to_pose(T: Array) -> Array | None:
-    """Shape (4, 4), a homogeneous matrix in metres -> pose (7,), or None where it is no pose.
+    """Homogeneous matrix (4, 4) in metres -> pose (7,), or None if it is invalid.
 
-    The rotation is made orthonormal (recorded ones are off by up to 4e-4); a matrix that is not
-    finite, or whose rotation part is further than 0.01 from a rotation, is no pose.
+    The rotation is made orthonormal (recorded ones deviate by up to 4e-4). A matrix is invalid if
+    it is not finite or its rotation part is more than 0.01 away from a rotation.
     """
     if not np.isfinite(T).all():
         return None
@@ -53,10 +53,10 @@ def matrix_to_pose(T: Array) -> Array | None:
 
 
 def seconds_to_ns(text: str) -> int:
-    """Seconds as a file writes them -> integer nanoseconds; raises ValueError where it is none."""
+    """Decimal seconds as text -> integer nanoseconds; raises ValueError if it is not a number."""
     seconds, _, fraction = text.partition(".")
     if seconds.isdecimal() and (fraction.isdecimal() or not fraction):
-        # A double holds present-day stamps to 200 ns only: count the digits instead.
+        # A double resolves present-day stamps only to 200 ns, so the digits are parsed.
         return int(seconds) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
     try:
         return round(float(text) * 1e9)
@@ -65,7 +65,7 @@ def seconds_to_ns(text: str) -> int:
 
 
 def nearest_stamp(stamps_ns: Sequence[int], stamp_ns: int, bound_ns: int) -> int | None:
-    """Index of the nearest of ascending stamps, the earlier of two; None where beyond the bound."""
+    """Return the index of the nearest ascending stamp (the earlier of two), None if too far."""
     right = bisect_left(stamps_ns, stamp_ns)
     nearest = min(
         range(max(0, right - 1), min(right + 1, len(stamps_ns))),
@@ -78,7 +78,7 @@ def nearest_stamp(stamps_ns: Sequence[int], stamp_ns: int, bound_ns: int) -> int
 
 
 class GroundTruth:
-    """True poses to hold against estimates; see ``open_ground_truth``."""
+    """True poses for comparison with estimates; see ``open_ground_truth``."""
 
     def __init__(self, by_name: dict[str, Array], stamps_ns: list[int], poses: list[Array]) -> None:
         self._by_name = by_name
@@ -98,11 +98,11 @@ class GroundTruth:
 def open_ground_truth(path: Path) -> GroundTruth:
     """Read a folder of ``<frame>.pose.txt`` (matched by name) or a TUM file (matched by stamp).
 
-    Raises SourceError where there is no pose to be had.
+    Raises SourceError if there is no valid pose.
     """
     if not path.exists():
         raise SourceError(
-            f"{path}: expected a TUM trajectory or a folder of *{MATRIX_SUFFIX}, found neither"
+            f"{path}: no such file; expected a TUM trajectory or a folder of *{MATRIX_SUFFIX}"
         )
     if path.is_dir():
         found = {
@@ -111,7 +111,9 @@ def open_ground_truth(path: Path) -> GroundTruth:
         }
         by_name = {name: pose for name, pose in found.items() if pose is not None}
         if not by_name:
-            raise SourceError(f"{path}: expected files *{MATRIX_SUFFIX}, found no valid one")
+            raise SourceError(
+                f"{path}: expected files *{MATRIX_SUFFIX} with a pose, found no valid file"
+            )
         return GroundTruth(by_name, [], [])
     return GroundTruth({}, *_read_tum(path))
 
@@ -140,17 +142,17 @@ def _read_tum(path: Path) -> tuple[list[int], list[Array]]:
             )
         if stamps and stamp <= stamps[-1]:
             raise SourceError(
-                f"{path}: expected growing stamps, found {fields[0]} in line {number}"
+                f"{path}: expected increasing stamps, found {fields[0]} in line {number}"
             )
         stamps.append(stamp)
         quaternion = geometry.quaternion_normalise(values[4:])
         poses.append(np.concatenate([values[1:4], quaternion]))
     if not stamps:
-        raise SourceError(f"{path}: expected a TUM trajectory, found no line")
+        raise SourceError(f"{path}: expected a TUM trajectory, found no poses")
     return stamps, poses
 
 
 def _is_rotation(quaternion: Array) -> bool:
-    """Whether it has a length that can be divided by."""
+    """Whether a quaternion can be normalised."""
     with np.errstate(over="ignore"):
         return 0.0 < float(quaternion @ quaternion) < np.inf

@@ -34,10 +34,10 @@ _STEEP_PITCH = np.deg2rad(80.0)
 
 
 class Seen(NamedTuple):
-    """One frame before its stream is known: what a worker returns and ``conclude`` takes.
+    """One frame before its stream checks: the result of a worker and the input of ``conclude``.
 
-    ``conformal_set`` is unbounded where the observation has a fault or a doubt. ``conformal_ms`` is
-    the time spent on the set, ``total_ms`` the time from reading the frame to having the set.
+    ``conformal_set`` is unbounded if the observation has a fault or a doubt. ``conformal_ms`` is
+    the time for the set, ``total_ms`` the time from reading the frame to the set.
     """
 
     frame: Frame
@@ -49,19 +49,19 @@ class Seen(NamedTuple):
 
 
 class Odometer:
-    """Pose intervals from camera images, by one bundle.
+    """Estimates pose intervals from camera images with one bundle.
 
-    One instance serves one stream: it numbers the frames. Use it as a context manager, or call
-    ``close``. Threads that call ``step`` on one instance wait for each other. A process that was
-    forked from the one that loaded it has to load its own (UsageError), and to end by ``os._exit``,
-    as the processes of ``multiprocessing`` do: onnxruntime does not let it end otherwise.
+    One instance serves one stream and numbers its frames. Use it as a context manager, or call
+    ``close``. Concurrent calls of ``step`` on one instance run one after another. A forked process
+    cannot use its parent's instance (UsageError) and must load its own; it must end by
+    ``os._exit``, as ``multiprocessing`` does, because onnxruntime blocks a normal exit.
 
     Parameters
     ----------
     bundle
         A bundle as ``read_bundle`` returns it.
     threads
-        Cores to use; all allowed ones by default.
+        Number of cores to use; all allowed cores by default.
     mode
         ``latency``, ``throughput`` or ``live``, see ``cvo_edge.scheduling``.
     confidence
@@ -125,14 +125,14 @@ class Odometer:
         cache: ModelCache | None = None,
         public_key: str | os.PathLike[str] | None = None,
     ) -> Odometer:
-        """Read a bundle folder and be ready to step; parameters and errors as the class's.
+        """Load a bundle folder; parameters and errors are those of the class.
 
-        With a cache, e.g. ``ModelCache.default()``, the model is prepared for this machine once and
-        later loaded in a fraction of time and memory; what it computes is the same. With a public
-        key (PEM, Ed25519) only a bundle signed with it is taken, and no older version of it from
-        then on.
+        With a cache, e.g. ``ModelCache.default()``, the model is prepared for this machine once;
+        later loads need a fraction of the time and memory, and results are bit-identical. With a
+        public key (PEM, Ed25519), the bundle must be signed with that key, and older versions of it
+        are rejected from then on.
 
-        Raises also what ``read_bundle`` raises.
+        Raises the errors of ``read_bundle``, too.
         """
         check = trust = None
         if public_key is not None:
@@ -155,7 +155,7 @@ class Odometer:
         except ModelError:
             if cache is None:
                 raise
-            # Another process may have cleared the cache in between.
+            # Another process may have cleared the cache after it was read.
             odometer = opened(None)
         if trust is not None:
             trust.remember()
@@ -184,11 +184,11 @@ class Odometer:
 
     @property
     def session(self) -> Session | None:
-        """The engine's session, for benchmarks beside it; None once closed."""
+        """The engine's session, for comparison in benchmarks; None after ``close``."""
         return self._observer.session
 
     def close(self) -> None:
-        """Give back the model's memory; closing twice is harmless, stepping afterwards an error."""
+        """Release the model's memory; repeated calls are harmless, later steps raise."""
         self._observer.close()
 
     def step(
@@ -198,47 +198,47 @@ class Odometer:
         source: str = "",
         read_ms: float = 0.0,
     ) -> PoseInterval:
-        """Estimate the pose of one image and the set that holds it.
+        """Estimate the camera pose of one image and the set that holds it.
 
         Parameters
         ----------
         image_bgr
-            Shape (height, width, 3), uint8, BGR as OpenCV reads it; grey, alpha and 16 bits are
-            converted. None, or what is no image, gives an ``invalid`` estimate.
+            Shape (height, width, 3), uint8, BGR as read by OpenCV; grey images, alpha channels and
+            16 bits are converted. None, or anything but an image, gives an ``invalid`` estimate.
         stamp_ns
-            Time of the image in integer nanoseconds, carried through.
+            Time of the image in integer nanoseconds; copied to the result.
         source
-            Name of the image, carried through.
+            Name of the image; copied to the result.
         read_ms
-            What reading it took, for the record's latencies.
+            Time it took to read the image, for the record's latencies.
 
         Raises
         ------
         UsageError
-            After ``close``, in a forked process, and for a stamp that is no int.
+            The odometer is closed or was loaded before a fork, or the stamp is not an int.
         ModelError
-            The engine failed.
+            Inference failed.
         """
         try:
             stamp_ns = None if stamp_ns is None else index(stamp_ns)
         except TypeError:
             raise UsageError(f"stamp_ns: expected an int or None, found {stamp_ns!r}") from None
         frame = Frame(image_bgr, stamp_ns, source, read_ms)
-        # A frame is compared with the one before it: two threads must not interleave.
+        # Stream checks compare consecutive frames, so threads must not interleave.
         with self._stepping:
             return self.conclude(self._see(frame, self._seq))
 
     def stream(self, frames: Iterable[Frame | NDArray[Any]]) -> Generator[PoseInterval, None, None]:
-        """Step through a source, or through frames or bare BGR images, lazily, in their order.
+        """Yield estimates for a source, for frames or for BGR images, lazily and in order.
 
-        The mode decides how, see ``cvo_edge.scheduling``. In ``throughput`` the files of a source
-        are also read and decoded in parallel. In ``live``, and with a camera in every mode, only
-        the newest frame is used; the numbers of dropped frames are missing in ``seq``. In ``live``
-        a recording is played by its stamps; an iterable of your own sets its own pace. The stream
-        checks start anew. Your own images may be overwritten once the next one is asked for.
+        The mode decides how frames are processed (see ``cvo_edge.scheduling``). In ``throughput``
+        mode the files of a source are also read and decoded in parallel. In ``live`` mode, and with
+        a camera in every mode, only the newest frame is used; ``seq`` skips the numbers of dropped
+        frames. ``live`` mode plays a recording by its stamps; any other iterable sets its own pace.
+        The stream checks start again. You may overwrite an image after requesting the next one.
 
-        Raises what the source raises, and UsageError for a path instead of a source, and in
-        ``live`` for a recording without stamps.
+        Raises the source's errors; raises UsageError for a path instead of a source and, in
+        ``live`` mode, for a recording without stamps.
         """
         if isinstance(frames, str | bytes | os.PathLike):
             raise UsageError(
@@ -253,19 +253,19 @@ class Odometer:
                 yield self.conclude(seen)
 
     def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
-        """Run the network on one image, without a threshold; see ``Observer.observe``."""
+        """Run the network on one image without applying a threshold; see ``Observer.observe``."""
         return self._observer.observe(image_bgr, seq)
 
     def conformal_set(
         self, observation: Observation, threshold: Threshold | None = None
     ) -> ConformalSet:
-        """Return the set of an observation, by default at the odometer's own threshold."""
+        """Return the set of an observation, by default with the odometer's threshold."""
         return self.head.conformal_set(
             observation.outputs, observation.point, threshold or self.threshold
         )
 
     def _see(self, frame: Frame, seq: int) -> Seen:
-        """Everything that does not depend on the frames before; safe in several threads."""
+        """Process a frame as far as it does not depend on earlier frames; thread-safe."""
         waited_ms = max(frame.read_ms, frame.since_arrival_ms(self._clock.now_s()))
         start = perf_counter()
         observation = self.observe(frame.image, seq)
@@ -277,9 +277,9 @@ class Odometer:
         return Seen(frame, seq, observation, found, conformal_ms, total_ms)
 
     def conclude(self, seen: Seen) -> PoseInterval:
-        """Add what the frames before speak against a frame; frames come once, in their order.
+        """Apply the stream checks and build the estimate; call it once per frame, in order.
 
-        A finite set is given only where neither the frame nor its stream raises a doubt.
+        The set is finite only if neither the frame checks nor the stream checks raise a doubt.
         """
         frame, observation = seen.frame, seen.observation
         self._seq = seen.seq + 1
@@ -312,7 +312,7 @@ class Odometer:
 
     @property
     def has_region(self) -> bool:
-        """Whether a set is a region of all six degrees of freedom together, not six sets."""
+        """Whether sets are joint regions of all six degrees of freedom."""
         return self.scope == "joint" and self.head.one_joint_score
 
     def _remarks(self, observation: Observation, found: ConformalSet) -> tuple[Reason, ...]:

@@ -1,4 +1,4 @@
-"""Poses, conformal sets and what the odometer returns for one frame."""
+"""Camera poses, and charts that map a pose to six numbers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Pose:
 
     @classmethod
     def from_array(cls, pose: ArrayLike) -> Pose:
-        """Shape (7,): tx ty tz qx qy qz qw -> Pose; raises UsageError where it is none."""
+        """Shape (7,): tx ty tz qx qy qz qw -> Pose; raises UsageError for invalid values."""
         try:
             values = np.asarray(pose, dtype=np.float64)
         except (TypeError, ValueError):
@@ -69,11 +69,11 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """How a pose becomes six numbers: tx ty tz in metres, then three rotation numbers in rad.
+    """Map from a pose to six numbers: tx ty tz in metres, then three rotation numbers in rad.
 
-    ``tangent_reference``: Log(R_reference^T R). ``tangent_predicted``: Log(R_predicted^T R), an
-    offset about the prediction. ``euler_zyx``: roll, pitch, yaw, each on the branch nearest to
-    the prediction's (so that an interval across +-pi stays one interval).
+    ``tangent_reference``: Log(R_reference^T R). ``tangent_predicted``: Log(R_predicted^T R), the
+    offset from the prediction. ``euler_zyx``: roll, pitch, yaw, each on the branch nearest to the
+    prediction's, so that an interval across +-pi stays one interval.
     """
 
     rotation: Rotation
@@ -90,7 +90,7 @@ class Chart:
         return self.rotation == "tangent_predicted"
 
     def coordinates(self, pose: ArrayLike, predicted: ArrayLike) -> Array:
-        """Six numbers of poses (..., 7) as seen from predictions (..., 7) -> (..., 6)."""
+        """Poses (..., 7) and predictions (..., 7) -> coordinates of the poses (..., 6)."""
         p = np.asarray(pose, dtype=np.float64)
         origin = np.asarray(predicted, dtype=np.float64)
         if self.rotation == "euler_zyx":
@@ -106,9 +106,9 @@ class Chart:
         return np.concatenate(np.broadcast_arrays(p[..., :3], turn), axis=-1)
 
     def point(self, pose: Array) -> Array:
-        """``coordinates(pose, pose)`` of one pose (7,), in a tenth of the time.
+        """Return ``coordinates(pose, pose)`` of one pose (7,), in a tenth of the time.
 
-        On the way of every frame, where a call into numpy costs more than the arithmetic in it.
+        It runs once per frame; for so few numbers, calling numpy takes longer than the arithmetic.
         """
         if self.rotation == "euler_zyx":
             return self.coordinates(pose, pose)
@@ -116,7 +116,7 @@ class Chart:
         if self._about_prediction or self.reference_q_xyzw is None:
             return np.array((tx, ty, tz, 0.0, 0.0, 0.0))
         a, b, c, d = self.reference_q_xyzw.tolist()
-        # Vector and scalar part of conj(reference) * q; the log takes the shorter way round.
+        # Vector and scalar part of conj(reference) * q; the log takes the shorter rotation.
         rx = d * x - a * w - b * z + c * y
         ry = d * y + a * z - b * w - c * x
         rz = d * z - a * y + b * x - c * w

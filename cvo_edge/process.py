@@ -1,6 +1,6 @@
-"""The life cycle of a program's process: signals, standard streams, exit codes.
+"""Process handling of the command lines: signals, standard streams, exit codes.
 
-Both command lines run within ``guarded``; nothing happens when this module is imported.
+Both command lines run in ``guarded``; importing this module has no side effects.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from typer.main import get_command
 
 from cvo_edge.errors import CvoError, SinkError, SourceError, printable
 
-# How long a signal may take by the ordinary way, which closes what is open.
+# How long regular cleanup after a signal may take.
 _PATIENCE_S = 0.8
-# Threads that read, of cameras and videos, and of files beside each other.
+# Names of the threads that may be blocked in a read when the program exits.
 _LEFT_BEHIND = ("cvo-edge reader", "cvo-edge worker")
 
 
 def prepare_environment() -> None:
-    """Set what numpy, OpenCV and FFmpeg read when they are imported.
+    """Set the environment variables that numpy, OpenCV and FFmpeg read on import.
 
-    numpy's thread pool would double the memory of a process that does no linear algebra in it.
-    OpenCV and FFmpeg print warnings of their own to stderr; this program reports what matters.
+    numpy's thread pool would double the memory of a process that does no large linear algebra.
+    OpenCV and FFmpeg print warnings to stderr, where this program prints its own messages.
     OpenCV's pixel limit backs up the check of image headers in ``cvo_edge.input.decoding``.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -38,31 +38,30 @@ def prepare_environment() -> None:
 
 
 def quiet_libraries() -> None:
-    """Keep OpenCV and FFmpeg from printing warnings, unless the user asked for them."""
+    """Silence warnings of OpenCV and FFmpeg, unless the user enabled them."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 def guarded(program: str, app: typer.Typer) -> NoReturn:
-    """Run a command line and leave with the documented exit code.
+    """Run a command line and exit with the documented exit code.
 
-    One line on stderr for every error from outside; a reader of stdout that has left ends it
-    quietly; SIGINT and SIGTERM unwind, so that sinks are flushed and closed. Both programs go
-    through here.
+    Every external error prints one line to stderr. A closed stdout pipe ends the program silently.
+    SIGINT and SIGTERM unwind the stack, so that sinks are flushed and closed.
     """
     signal.signal(signal.SIGTERM, _terminate)
     if sys.stdout is not None:
-        # A terminal of another character set is told what it can show.
+        # Escape characters that the terminal's character set lacks.
         with contextlib.suppress(AttributeError):
             sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     command = get_command(app)
     try:
         if sys.stdout is None:
-            raise SinkError("standard output: expected an open stream, found it closed")
+            raise SinkError("standard output: closed; redirect it to a file or /dev/null")
         if f"_{program.replace('-', '_').upper()}_COMPLETE" in os.environ:
-            # The shell asks for completions; they are not commands of ours.
+            # The shell requests completions, which typer handles itself.
             command.main(prog_name=program)
-        # Not command.main(): it has exit codes of its own for signals and closed pipes.
+        # command.main() would use other exit codes for signals and closed pipes.
         with command.make_context(program, sys.argv[1:] or ["--help"]) as context:
             command.invoke(context)
         sys.stdout.flush()
@@ -81,7 +80,7 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
     except Terminated:
         code = 128 + signal.SIGTERM
     except SystemExit as leaving:
-        # rich ends the process itself where the reader of a help page has left.
+        # rich exits by itself if the reader of a help page has closed the pipe.
         if not isinstance(leaving.__context__, BrokenPipeError):
             raise
         code = 0
@@ -89,8 +88,8 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
         code = _complain(program, "not enough memory for this command", 1)
     except Exception as error:
         if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
-            _leave(_complain(program, "no more threads can be started on this machine", 1))
-        # A module in C that is being initialised makes an error of its own of what a signal raises.
+            _leave(_complain(program, "this machine cannot start more threads", 1))
+        # A C extension that is being imported replaces the exception that a signal raises.
         if _terminated.is_set():
             code = 128 + signal.SIGTERM
         elif not isinstance(error, OSError):
@@ -101,7 +100,7 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
 
 
 def _unforeseen(program: str, error: OSError) -> int:
-    """What the modules did not foresee: a path too long, standard output on a full disk."""
+    """Report an unhandled OSError, e.g. a path that is too long or a full disk."""
     failed = SourceError if error.filename else SinkError
     where = error.filename or "standard output"
     code = _complain(program, f"{where}: {error.strerror}", failed.exit_code)
@@ -110,10 +109,10 @@ def _unforeseen(program: str, error: OSError) -> int:
 
 
 def _leave(code: int) -> NoReturn:
-    """End the process, also where a thread waits for a camera that gives no more frames.
+    """Exit, even if a thread waits for a camera that delivers no more frames.
 
-    Python would end such a thread inside OpenCV, which takes the process with it, exit code and
-    all, or wait for it. Everything of ours is written by now.
+    Python would either wait for such a thread or end it inside OpenCV, which crashes the process
+    and loses the exit code. All output is written before this call.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -121,7 +120,7 @@ def _leave(code: int) -> NoReturn:
             if stream is not None:
                 stream.flush()
         except (OSError, ValueError):
-            # Or Python tries again, fails, and has an exit code of its own for that.
+            # Otherwise Python flushes again at exit, fails, and changes the exit code.
             setattr(sys, name, None)
     if any(thread.name.startswith(_LEFT_BEHIND) for thread in threading.enumerate()):
         os._exit(code)
@@ -129,25 +128,25 @@ def _leave(code: int) -> NoReturn:
 
 
 def _complain(program: str, message: str, code: int) -> int:
-    """One line on stderr."""
+    """Print one line to stderr and return the exit code."""
     say(f"{program}: {printable(message)}")
     return code
 
 
 def say(text: str) -> None:
-    """Print to stderr; where nobody can read it, the exit code is what is left to say."""
+    """Print to stderr; failures are ignored, because the exit code reports the error, too."""
     if sys.stderr is not None:
         with contextlib.suppress(OSError, ValueError):
             print(text, file=sys.stderr, flush=True)
 
 
 def _drop_stdout() -> None:
-    """Keep Python from complaining when it flushes a broken stdout once more at exit."""
+    """Redirect a broken stdout, so that Python does not report an error at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Terminated(SystemExit):
-    """SIGTERM has come: what is open is to be closed, and the process to end."""
+    """Raised on SIGTERM, to close open files and end the process."""
 
 
 _terminated = threading.Event()
@@ -159,10 +158,10 @@ def _terminate(number: int, _: FrameType | None) -> NoReturn:
 
 
 def end_within_a_second() -> None:
-    """Have SIGINT and SIGTERM end this process soon, also where no handler of Python's can run.
+    """Make SIGINT and SIGTERM end this process within a second, even while C code runs.
 
-    An inference without end, a picture of many passes, a file that is not given: while C is at
-    work, Python waits. Every finished record is on its way to the disk by then.
+    Python runs its signal handlers only between bytecodes, so a hanging inference, decoder or read
+    would delay them. Finished records are already written.
     """
     receiver, sender = os.pipe()
     os.set_blocking(sender, False)
@@ -175,13 +174,13 @@ def end_within_a_second() -> None:
                 time.sleep(_PATIENCE_S)
                 os._exit(128 + number)
 
-    with contextlib.suppress(RuntimeError):  # without a thread it is as it was
+    with contextlib.suppress(RuntimeError):  # no thread: only Python's own handlers
         threading.Thread(target=watch, name="cvo-edge signals", daemon=True).start()
 
 
 def keep_libraries_off_stderr() -> None:
-    """Leave stderr to us: decoders and engines in C write there what they think of their input."""
-    # Whoever started us without one of the first three would have a file of ours there.
+    """Reserve stderr for this program: C decoders and engines print messages there."""
+    # If a standard descriptor is closed, the next file opened would take its place.
     for descriptor in range(3):
         try:
             os.fstat(descriptor)

@@ -1,14 +1,14 @@
 """How a stream of frames uses the cores: three modes, and the loops that run them.
 
-- ``latency``: one frame after the other, each as fast as all cores can make it.
-- ``throughput``: as many frames at a time as there are cores, each on one of them. Most frames a
-  second, but each frame takes longer. The order is kept; estimates arrive in bunches, which suits
-  recordings.
-- ``live``: the newest frame of a steady camera, with little processor time. No thread spins while
-  it waits, and frames that arrive during processing are dropped.
+- ``latency``: one frame at a time, on all cores.
+- ``throughput``: as many frames in parallel as there are cores, each on one core. This gives the
+  highest frame rate, but each frame takes longer. Estimates keep the order of the frames and arrive
+  in bursts, which suits recordings.
+- ``live``: the newest frame of a camera, with little processor time. Threads do not busy-wait, and
+  frames that arrive during processing are dropped.
 
-A loop takes frames, calls ``work`` on each (in threads of its own in ``throughput``), and yields
-the results in the order of the frames.
+Each loop calls ``work`` on every frame (in worker threads in ``throughput``) and yields the results
+in the order of the frames.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from cvo_edge.input.newest import Newest, Played
 from cvo_edge.vocabulary import MODES, Mode
 
 Result = TypeVar("Result")
-# A frame and its number in the stream -> what is made of it.
+# A frame and its number in the stream -> the result for it.
 Work = Callable[[Frame, int], Result]
 
-# Frames queued behind those in work, so that one slow frame does not leave cores idle.
+# Frames queued behind those being processed, so that a slow frame leaves no core idle.
 AHEAD = 2
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Settings of a mode: threads of one inference, whether they spin, frames at a time."""
+    """Settings of a mode: threads per inference, whether they spin, frames in parallel."""
 
     threads: int
     spinning: bool
@@ -50,9 +50,9 @@ class Plan:
 
 
 def plan(mode: Mode, threads: int | None = None) -> Plan:
-    """Return the settings of a mode for ``threads`` in all, by default one for each allowed core.
+    """Return the settings of a mode for ``threads`` in total, by default one per allowed core.
 
-    Raises UsageError for a number of threads that is out of range.
+    Raises UsageError if the number of threads is out of range.
     """
     threads = checked_threads(threads)
     if mode == "throughput":
@@ -61,7 +61,7 @@ def plan(mode: Mode, threads: int | None = None) -> Plan:
 
 
 def checked_mode(mode: str) -> Mode:
-    """Return the mode of that name; raises UsageError where there is none."""
+    """Return the mode of that name; raises UsageError if it is unknown."""
     for known in MODES:
         if known == mode:
             return known
@@ -76,25 +76,25 @@ def run_stream(
     next_seq: Callable[[], int],
     clock: Clock = SYSTEM_CLOCK,
 ) -> Generator[Result, None, None]:
-    """Yield what ``work`` makes of each frame, in the order of the frames.
+    """Yield the result of ``work`` for each frame, in the order of the frames.
 
     Parameters
     ----------
     frames
-        A source, or frames or bare images, whose memory may be reused once the next is asked for.
+        A source, or frames or bare images, whose memory may be reused after the next request.
     mode, workers
-        The mode, and the number of frames at a time in ``throughput``.
+        The mode, and the number of frames in parallel in ``throughput``.
     work
         Called with each frame and its number.
     next_seq
-        Number of the next frame that nobody has been given yet.
+        Returns the number of the next frame.
     clock
-        Paces a recording in ``live``, and dates the arrival of frames.
+        Paces a recording in ``live`` and dates the arrival of frames.
 
-    Raises what the source and ``work`` raise, in its place after the results before it, and in
-    ``live`` UsageError for a recording without stamps.
+    Raises errors of the source and of ``work`` after the results of earlier frames, and in ``live``
+    UsageError for a recording without stamps.
     """
-    # The frames of a camera have to be taken as they come: those that nobody takes grow old.
+    # A camera must be read continuously; frames left in its queue become stale.
     if mode == "live" or (isinstance(frames, Source) and frames.live):
         with closing(_newest(frames, clock)) as newest:
             yield from _one_by_one(newest, work, next_seq)
@@ -110,7 +110,7 @@ def run_stream(
 def _newest(frames: Iterable[Frame | NDArray[Any]], clock: Clock) -> Generator[Frame, None, None]:
     if isinstance(frames, Source):
         coming = frames if frames.live else Played(frames, clock)
-        # A source that somebody else wrote need not have it.
+        # A user-defined source may have no stop method.
         return iter(Newest(coming, getattr(coming, "stop", None), clock))
     return iter(Newest(map(_kept, frames), clock=clock))
 
@@ -131,7 +131,7 @@ def _as_frame(frame: Frame | NDArray[Any]) -> Frame:
 
 
 def _kept(frame: Frame | NDArray[Any]) -> Frame:
-    """Copy a caller's image, as the caller may write the next one into the same memory."""
+    """Copy the caller's image, because the caller may reuse its memory."""
     given = _as_frame(frame)
     image = given.image
     return replace(given, image=image.copy() if isinstance(image, np.ndarray) else image)
@@ -143,10 +143,10 @@ def _already_read(frame: Frame | NDArray[Any]) -> Callable[[], Frame]:
 
 
 def in_order(tasks: Iterable[Callable[[], Result]], workers: int) -> Generator[Result, None, None]:
-    """Run tasks in ``workers`` threads and yield what they return, in their order.
+    """Run tasks in ``workers`` threads and yield their results in order.
 
-    Tasks are taken as they are needed: never more than a few are under way. What a task raises, or
-    a source of tasks that ends early, is raised in its place, after the results before it.
+    Tasks are fetched on demand, so only a few are pending at a time. An error of a task, or of the
+    iterable itself, is raised after the results of the tasks before it.
     """
     pending: deque[Future[Result]] = deque()
     pool = ThreadPoolExecutor(workers, "cvo-edge worker")
@@ -158,12 +158,12 @@ def in_order(tasks: Iterable[Callable[[], Result]], workers: int) -> Generator[R
         while pending:
             yield pending.popleft().result()
     finally:
-        # Whoever leaves does not wait for what is being read.
+        # Do not wait for reads in progress.
         pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _failing_last(tasks: Iterable[Callable[[], Result]]) -> Iterator[Callable[[], Result]]:
-    """Tasks, and where their source ends with an error one more that raises it."""
+    """Yield the tasks and, if their iterable fails, a final task that raises its error."""
     try:
         yield from tasks
     except Exception as error:  # noqa: BLE001 - raised in its place

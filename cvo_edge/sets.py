@@ -1,4 +1,4 @@
-"""Conformal sets: what holds the six degrees of freedom of a pose with a stated probability."""
+"""Conformal sets, which hold the six degrees of freedom of a pose with a stated probability."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Bands = tuple[tuple[tuple[float, float], ...], ...]
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoids:
-    """A region of all six degrees of freedom: a union of ellipsoids of one shape.
+    """A region of all six degrees of freedom: a union of ellipsoids of equal shape.
 
-    It holds y where min_j |scale^-1 (y - centres_j)| <= radius.
+    It contains y if min_j |scale^-1 (y - centres_j)| <= radius.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Ellipsoids:
     radius: float
 
     def distance(self, coordinates: ArrayLike) -> float:
-        """Scaled distance of six coordinates (6,) to the nearest centre."""
+        """Return the scaled distance from six coordinates (6,) to the nearest centre."""
         return float(scaled_distance(self.centres, self.scale, np.asarray(coordinates, np.float64)))
 
     def contains(self, coordinates: ArrayLike) -> bool:
@@ -46,8 +46,8 @@ class Ellipsoids:
 def scaled_distance(centres: NDArray[Any], scale: NDArray[Any], y: Array) -> Array:
     """Return min_j |scale^-1 (y - centres_j)|.
 
-    Centres (..., J, 6), lower triangular scale (..., 6, 6) and y (..., 6) -> (...). Infinite where
-    the scale has no inverse: what has no extent holds nothing.
+    Centres (..., J, 6), lower triangular scale (..., 6, 6) and y (..., 6) -> (...). The distance is
+    infinite if the scale is singular: such an ellipsoid has no volume.
     """
     difference = y[..., np.newaxis, :] - centres.astype(np.float64)
     rows = scale.astype(np.float64)[..., np.newaxis, :, :]
@@ -70,15 +70,15 @@ class ConformalSet:
     Attributes
     ----------
     lower, upper
-        Shape (6,): its hull in the bundle's chart, m and rad; infinite where unbounded.
+        Shape (6,): hull of the set in the bundle's chart, m and rad; infinite where unbounded.
     bands
-        For methods whose sets may have gaps: per DoF the disjoint intervals (low, high) in
-        ascending order; None where the set is its hull.
+        For methods whose sets may have gaps: the disjoint intervals (low, high) of each DoF in
+        ascending order; None if the set equals its hull.
     crossed
-        Whether a correction emptied the set of some DoF, so that its middle stands for it.
+        Whether a correction emptied the set of some DoF, which then is its midpoint.
     ellipsoids
-        For a method with a region of all six together, in the joint scope: that region, of which
-        lower and upper are the hull; None where the set is the product of its DoF's sets.
+        The joint region of all six DoF, whose hull is given by ``lower`` and ``upper``; None if the
+        set is the product of six sets.
     """
 
     lower: Array
@@ -88,7 +88,7 @@ class ConformalSet:
     ellipsoids: Ellipsoids | None = None
 
     def covers(self, coordinates: ArrayLike) -> NDArray[np.bool_]:
-        """Which of six coordinates (6,) lie in the set, shape (6,); gaps count as outside."""
+        """Tell which of six coordinates (6,) lie in the set, shape (6,); gaps are outside."""
         y = np.asarray(coordinates, dtype=np.float64)
         if self.bands is None:
             return np.asarray((self.lower <= y) & (y <= self.upper))
@@ -100,14 +100,14 @@ class ConformalSet:
         )
 
     def contains(self, coordinates: ArrayLike) -> bool:
-        """Whether six coordinates (6,) lie in the region, where there is one, else in all sets."""
+        """Whether six coordinates (6,) lie in the region or, without a region, in all six sets."""
         if self.ellipsoids is not None:
             return self.ellipsoids.contains(coordinates)
         return bool(self.covers(coordinates).all())
 
     def within(self, lowest: Array, highest: Array) -> ConformalSet:
-        """Return the set with its unbounded sides put at these limits, (6,) each."""
-        # A finite side beyond the limit of the other one leaves a set without width.
+        """Return the set with its unbounded sides moved to these limits, (6,) each."""
+        # If the finite side lies beyond the limit of the unbounded one, the set has zero width.
         lower = np.where(np.isfinite(self.lower), self.lower, np.minimum(lowest, self.upper))
         upper = np.where(np.isfinite(self.upper), self.upper, np.maximum(highest, self.lower))
         bands = self.bands
@@ -119,13 +119,13 @@ class ConformalSet:
         return replace(self, lower=lower, upper=upper, bands=bands)
 
     def width(self) -> Array:
-        """Measure of the set per DoF, (6,): of the union of its bands, not of their hull."""
+        """Return the width per DoF, (6,): the total length of the bands, not of their hull."""
         if self.bands is None:
             return self.upper - self.lower
         return np.array([sum(high - low for low, high in row) for row in self.bands])
 
     def distance(self, coordinates: ArrayLike) -> Array:
-        """Distance of six coordinates (6,) to the nearest point of the set per DoF; 0 inside."""
+        """Return the distance from six coordinates (6,) to the set, per DoF; 0 inside."""
         y = np.asarray(coordinates, dtype=np.float64)
         if self.bands is None:
             return np.asarray(np.maximum(np.maximum(self.lower - y, y - self.upper), 0.0))
@@ -143,5 +143,5 @@ _UNBOUNDED.upper.setflags(write=False)
 
 
 def unbounded_set() -> ConformalSet:
-    """The set that holds everything: what is known where a check failed."""
+    """Return the set that holds everything, used if a check failed."""
     return _UNBOUNDED

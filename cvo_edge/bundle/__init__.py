@@ -1,1 +1,1 @@
-"""A bundle on disk: its format, strict reading and writing, rules and signature."""
+"""Bundles on disk: format, strict reading and writing, consistency rules, signatures."""

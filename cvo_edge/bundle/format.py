@@ -14,9 +14,9 @@ from cvo_edge.vocabulary import Crop, Joint, Precision, Provider, Rule, Scope, S
 
 CALIBRATION_FILE = "calibration.json"
 MODEL_FILE: Literal["model.onnx"] = "model.onnx"
-# A confidence in single precision, e.g. numpy.float32(0.9), means the stored one.
+# Tolerance for confidences in single precision, e.g. numpy.float32(0.9).
 _SAME_CONFIDENCE = 1e-7
-# Every bundle stores at least these, for both scopes.
+# Every bundle stores at least these confidences, for both scopes.
 CONFIDENCES = (0.5, 0.8, 0.9, 0.95, 0.99)
 
 # No control characters and no lone surrogates: texts are printed on terminals.
@@ -24,7 +24,7 @@ Text = Annotated[
     str, Meta(min_length=1, max_length=200, pattern="^[^\x00-\x1f\x7f-\x9f\ud800-\udfff]+$(?!\n)")
 ]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$(?!\n)")]
-# Metres, radians, probabilities, scales: no output, and no number of a calibration, is near this.
+# Far above every plausible value, whether metres, radians, probabilities or scales.
 MAX_NUMBER = 1e9
 Number = Annotated[float, Meta(gt=-MAX_NUMBER, lt=MAX_NUMBER)]
 Positive = Annotated[float, Meta(gt=0, lt=MAX_NUMBER)]
@@ -40,7 +40,7 @@ Parameters = TypeVar("Parameters", bound=Struct)
 
 
 class _Strict(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Immutable; every key required unless it has a default, none more allowed."""
+    """Immutable; keys without a default are required, unknown keys are an error."""
 
 
 class TensorSpec(_Strict, frozen=True):
@@ -52,9 +52,10 @@ class TensorSpec(_Strict, frozen=True):
 
 
 class ModelSpec(_Strict, frozen=True, omit_defaults=True):
-    """Which model file this calibration belongs to, and the engine whose numbers it is about.
+    """The calibrated model file and the inference engine that it was calibrated with.
 
-    In 8 bits engines differ by more than a rounding: thresholds of one are not those of another.
+    In 8 bits, results of different engines differ by more than rounding errors, so thresholds are
+    valid for one engine only.
     """
 
     file: Literal["model.onnx"]
@@ -67,10 +68,10 @@ class ModelSpec(_Strict, frozen=True, omit_defaults=True):
 
 
 class PreprocessSpec(_Strict, frozen=True):
-    """From a camera image to the model's input; ``in_graph`` names what the model does itself.
+    """Conversion of a camera image to the model's input; ``in_graph`` lists steps in the model.
 
-    The model then computes (value - mean) / std per channel, in the order rgb, layout NCHW; both
-    are null for a given network whose normalisation only its graph knows.
+    The model computes (value - mean) / std per channel, in RGB order and NCHW layout. ``mean`` and
+    ``std`` are null for a network supplied as an ONNX file that contains its own normalisation.
     """
 
     height: Annotated[int, Meta(ge=16, le=4096)]
@@ -85,10 +86,11 @@ class PreprocessSpec(_Strict, frozen=True):
 
 
 class PoseLimits(_Strict, frozen=True):
-    """Lowest and highest plausible value per DoF: outside is absurd.
+    """Lowest and highest plausible value per DoF; poses outside them are invalid.
 
-    In the chart of the pose; with ``tangent_predicted``, where a prediction's own rotation numbers
-    are zero, in the tangent at ``reference_q_xyzw`` (about nothing where that is null).
+    The limits apply in the chart of the pose. With ``tangent_predicted``, where every prediction
+    has zero rotation coordinates, they apply in the tangent space at ``reference_q_xyzw``; if that
+    is null, they do not restrict the rotation.
     """
 
     lowest: Six
@@ -96,7 +98,7 @@ class PoseLimits(_Strict, frozen=True):
 
 
 class PoseSpec(_Strict, frozen=True):
-    """What the six numbers mean, in which frames and units."""
+    """Meaning, reference frames and units of the six pose coordinates."""
 
     target: Literal["absolute"]
     frame_id: Text
@@ -109,10 +111,10 @@ class PoseSpec(_Strict, frozen=True):
 
 
 class Threshold(_Strict, frozen=True):
-    """q_hat for one confidence and scope; null is unbounded.
+    """q_hat for one confidence and scope; null means unbounded.
 
-    With a two-sided score ``q_hat`` is for the lower side and ``q_hat_upper`` for the upper one;
-    for all others ``q_hat_upper`` is null as a whole.
+    With a two-sided score, ``q_hat`` belongs to the lower side and ``q_hat_upper`` to the upper
+    side. With other scores, ``q_hat_upper`` is null.
     """
 
     confidence: Annotated[float, Meta(gt=0, le=1 - 1e-9)]
@@ -122,10 +124,10 @@ class Threshold(_Strict, frozen=True):
 
 
 class SplitSpec(_Strict, frozen=True):
-    """Which frames had which role, so that the same test frames can be found again.
+    """Assignment of frames to roles, so that the test frames can be reproduced.
 
-    ``purpose``: ``training`` deals all five roles; ``calibration`` deals val, cal and test alone,
-    on data that the network has not seen.
+    ``purpose``: ``training`` assigns all five roles; ``calibration`` assigns only val, cal and
+    test, on data that the network has not seen.
     """
 
     purpose: Literal["training", "calibration"]
@@ -135,10 +137,10 @@ class SplitSpec(_Strict, frozen=True):
 
 
 class CalibrationSpec(_Strict, frozen=True):
-    """Where the thresholds come from.
+    """Data and rules that the thresholds were computed with.
 
-    ``joint`` is how six scores become one for the joint scope: the largest of them, made comparable
-    on val (``max``), or six thresholds at a sixth of the miscoverage (``bonferroni``).
+    ``joint`` says how the joint scope combines six scores: ``max`` takes the largest one after
+    scaling them on val; ``bonferroni`` uses six thresholds, each at a sixth of the miscoverage.
     """
 
     score: Text
@@ -152,7 +154,7 @@ class CalibrationSpec(_Strict, frozen=True):
 
 
 class SelfTest(_Strict, frozen=True):
-    """An image by an integer recipe and what the model must answer to it."""
+    """A synthetic image from an integer recipe, and the outputs expected for it."""
 
     recipe: Literal["ripples-1"]
     height: Annotated[int, Meta(ge=16, le=4096)]
@@ -164,8 +166,8 @@ class SelfTest(_Strict, frozen=True):
 class Provenance(_Strict, frozen=True):
     """How the bundle was made: names and digests, never a path.
 
-    ``backbone`` and ``training_split`` are null for a given network that came as an ONNX file. The
-    split of the run stays when a bundle is calibrated anew: it says which frames are not new.
+    ``backbone`` and ``training_split`` are null for a network supplied as an ONNX file.
+    Recalibration keeps ``training_split``, because it tells which frames the network has seen.
     """
 
     created_with: dict[Text, Text]
@@ -178,7 +180,7 @@ class Provenance(_Strict, frozen=True):
 
 
 class Calibration(_Strict, frozen=True):
-    """The whole of ``calibration.json``, version 1."""
+    """The contents of ``calibration.json``, version 1."""
 
     schema_version: Literal[1]
     name: Text
@@ -196,7 +198,7 @@ class Calibration(_Strict, frozen=True):
     def threshold(self, confidence: float, scope: Scope) -> Threshold | None:
         """Return the stored threshold for this confidence and scope, or None.
 
-        A confidence in single precision is found as well.
+        Confidences match within 1e-7, so single-precision values are found, too.
         """
         for entry in self.thresholds:
             if entry.scope == scope and math.isclose(
@@ -206,7 +208,7 @@ class Calibration(_Strict, frozen=True):
         return None
 
     def stored_threshold(self, confidence: float, scope: Scope) -> Threshold:
-        """Return the stored threshold; raises UsageError that names what is stored."""
+        """Return the stored threshold; raises UsageError that lists the stored confidences."""
         if scope not in get_args(Scope):
             raise UsageError(
                 f"scope: expected one of {', '.join(get_args(Scope))}, found {shown(scope)}"
@@ -233,7 +235,7 @@ class Calibration(_Strict, frozen=True):
     def parameters(self, kind: type[Parameters]) -> Parameters:
         """Return ``method_parameters`` as the method's own struct.
 
-        Raises CalibrationFileError where they are another method's, or out of their ranges.
+        Raises CalibrationFileError if they belong to another method or are out of range.
         """
         try:
             return msgspec.convert(self.method_parameters, kind, strict=True)
@@ -242,7 +244,7 @@ class Calibration(_Strict, frozen=True):
 
 
 def shown(value: object) -> str:
-    """Return what was found, as one line of bounded length for an error message."""
+    """Return the repr of a value as one line of bounded length, for an error message."""
     return one_line(repr(value))
 
 

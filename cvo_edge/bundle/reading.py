@@ -1,6 +1,6 @@
-"""Reading and writing a bundle folder: strict JSON, digests, and errors that name key and rule.
+"""Read and write bundle folders: strict JSON, digests, errors that name the key and the rule.
 
-Both sides of the project read and write bundles through this module alone.
+Both packages read and write bundles only through this module.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from cvo_edge.errors import BundleMismatchError, CalibrationFileError, ModelErro
 from cvo_edge.files import read_regular_file, regular_file
 
 SCHEMA_VERSION = 1
-# Stands for the digest of a calibration that has not been written.
+# Placeholder for the digest of a calibration that has not been written.
 UNWRITTEN = "0" * 64
 MAX_CALIBRATION_BYTES = 64 * 1024
 MAX_MODEL_BYTES = 1 << 30
 MAX_DEPTH = 16
 
 
-# What else must hold for a bundle, of its folder, its calibration and the bytes it was read from.
+# An additional check of a bundle, given its folder, its calibration and the file's bytes.
 Check = Callable[[Path, Calibration, bytes], None]
 
 
 def read_model(folder: Path, calibration: Calibration) -> bytes:
-    """Read ``model.onnx`` once; returns the very bytes whose digest matches the calibration's.
+    """Read ``model.onnx`` once and return the bytes whose digest was checked.
 
-    Raises ModelError where the file is missing, not a regular one or too large, and
-    BundleMismatchError where it is not the calibrated model.
+    Raises ModelError if the file is missing, not a regular file or too large, and
+    BundleMismatchError if it is not the calibrated model.
     """
     path = folder / MODEL_FILE
     model = read_regular_file(path, MAX_MODEL_BYTES, ModelError)
@@ -46,7 +46,7 @@ def read_model(folder: Path, calibration: Calibration) -> bytes:
 
 
 def check_model_file(folder: Path, calibration: Calibration) -> None:
-    """Raise as ``read_model`` where a model file is not the calibrated one, keeping none of it."""
+    """Check the model file without keeping its contents; raises as ``read_model``."""
     path = folder / MODEL_FILE
     with regular_file(path, MAX_MODEL_BYTES, ModelError) as stream:
         try:
@@ -65,25 +65,27 @@ def _check_model_digest(path: Path, found: str, calibration: Calibration) -> Non
 
 
 def read_calibration(folder: str | os.PathLike[str]) -> Calibration:
-    """Read and check ``calibration.json`` of a bundle folder; raises CalibrationFileError."""
+    """Read and check the ``calibration.json`` of a bundle; raises CalibrationFileError."""
     return read_calibration_file(folder)[0]
 
 
 def read_calibration_file(folder: str | os.PathLike[str]) -> tuple[Calibration, bytes]:
-    """Return also the file's bytes, for a signature; else as ``read_calibration``."""
-    # Not is_dir(): it raises for a name that is too long.
+    """Do the same as ``read_calibration``, and return the file's bytes for signature checks."""
+    # Path.is_dir() raises for a name that is too long.
     if not os.path.isdir(folder):  # noqa: PTH112
-        raise CalibrationFileError(f"{folder}: expected a bundle folder, found none")
+        raise CalibrationFileError(
+            f"{folder}: no such folder; expected a bundle with {CALIBRATION_FILE} and {MODEL_FILE}"
+        )
     path = Path(folder) / CALIBRATION_FILE
     content = read_regular_file(path, MAX_CALIBRATION_BYTES, CalibrationFileError)
     return decode_calibration(content, str(path)), content
 
 
 def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibration:
-    """Bytes of ``calibration.json`` -> Calibration; ``where`` names them in errors.
+    """Parse and check the bytes of ``calibration.json``; ``where`` names them in errors.
 
-    The order of the checks is that of the trust they need: encoding, JSON, version, digest,
-    structure, then the rules between keys. Raises CalibrationFileError.
+    The checks run in this order: encoding, JSON, version, digest, structure, rules between keys.
+    Raises CalibrationFileError.
     """
     try:
         document = _parse_json(content)
@@ -96,10 +98,10 @@ def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibra
         _check_digest(content)
         calibration = msgspec.convert(document, Calibration, strict=True)
         check_rules(calibration)
-        # JSON can say half of a surrogate pair, which nobody can print.
+        # A JSON escape can encode half of a surrogate pair, which cannot be printed.
         json.dumps(document, ensure_ascii=False).encode()
     except UnicodeEncodeError:
-        raise CalibrationFileError(f"{where}: expected characters, found half of one") from None
+        raise CalibrationFileError(f"{where}: contains an unpaired UTF-16 surrogate") from None
     except CalibrationFileError as error:
         raise CalibrationFileError(f"{where}: {error}") from None
     except msgspec.ValidationError as error:
@@ -108,7 +110,7 @@ def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibra
 
 
 def _parse_json(content: bytes) -> dict[str, Any]:
-    """Strict JSON: UTF-8 without BOM, one object, no duplicate key, every number finite."""
+    """Parse strict JSON: UTF-8 without BOM, one object, no duplicate keys, finite numbers only."""
     if content.startswith(b"\xef\xbb\xbf"):
         raise CalibrationFileError("expected UTF-8 without a byte order mark, found one")
     if _depth(content) > MAX_DEPTH:
@@ -123,11 +125,11 @@ def _parse_json(content: bytes) -> dict[str, Any]:
         )
     except UnicodeDecodeError as error:
         raise CalibrationFileError(
-            f"expected UTF-8, found byte {error.start} that is not"
+            f"expected UTF-8, found an invalid byte at offset {error.start}"
         ) from None
     except json.JSONDecodeError as error:
         raise CalibrationFileError(
-            f"expected JSON, found an error in line {error.lineno} column {error.colno}: "
+            f"expected JSON, found a syntax error in line {error.lineno} column {error.colno}: "
             f"{error.msg}"
         ) from None
     if not isinstance(document, dict):
@@ -136,7 +138,7 @@ def _parse_json(content: bytes) -> dict[str, Any]:
 
 
 def _depth(content: bytes) -> int:
-    """Deepest nesting of brackets, counted before parsing; brackets in strings count as well."""
+    """Return the deepest nesting of brackets, including those in strings, without parsing."""
     deepest = depth = 0
     for byte in content:
         if byte in b"[{":
@@ -169,7 +171,7 @@ def _finite_float(text: str) -> float:
 
 def _bounded_int(text: str) -> int:
     if len(text) > 20:
-        raise CalibrationFileError(f"expected at most 20 digits, found a number of {len(text)}")
+        raise CalibrationFileError(f"expected integers of at most 20 digits, found {len(text)}")
     return int(text)
 
 
@@ -177,14 +179,14 @@ _DIGEST = re.compile(rb'"digest"\s*:\s*"([0-9a-f]{64})"')
 
 
 def encode_calibration(calibration: Calibration) -> bytes:
-    """Calibration -> the bytes of ``calibration.json`` with its own digest filled in.
+    """Return the bytes of ``calibration.json`` with the digest filled in.
 
-    What was written is read back before it is returned, so that nothing the reader would refuse
-    is ever written. Raises CalibrationFileError.
+    The bytes are decoded again before they are returned, so that every written file is readable.
+    Raises CalibrationFileError.
     """
     blank = msgspec.structs.replace(calibration, digest=UNWRITTEN)
     text = json.dumps(msgspec.to_builtins(blank), indent=1, ensure_ascii=False, allow_nan=False)
-    # One line a list of numbers: the file is read by people, too.
+    # Each list of numbers goes on one line, to keep the file readable.
     text = re.sub(r"\[\s+([^\[\]{}\"]*?)\s+\]", _joined, text) + "\n"
     content = text.encode("utf-8")
     start, stop = _digest_span(content)
@@ -208,7 +210,7 @@ def _digest_span(content: bytes) -> tuple[int, int]:
     spans = [match.span(1) for match in _DIGEST.finditer(content)]
     if len(spans) != 1:
         raise CalibrationFileError(
-            f"digest: expected one key with 64 hexadecimal digits, found {len(spans)}"
+            f"digest: expected one key with 64 hexadecimal digits, found {len(spans)} keys"
         )
     return spans[0]
 

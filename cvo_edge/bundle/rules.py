@@ -1,4 +1,4 @@
-"""The rules between the keys of ``calibration.json`` that no key has alone."""
+"""Consistency rules between the keys of ``calibration.json``."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from cvo_edge.errors import CalibrationFileError
 
 
 def check_rules(calibration: Calibration) -> None:
-    """Raise CalibrationFileError, naming key and rule, where keys contradict one another."""
+    """Raise CalibrationFileError, naming the key and the rule, if keys contradict each other."""
     pose = calibration.pose
     given = pose.reference_q_xyzw is not None
-    # An offset about the prediction needs no reference; its plausible limits may.
+    # tangent_predicted needs no reference itself, but the pose limits may.
     if pose.rotation != "tangent_predicted" and given != (pose.rotation == "tangent_reference"):
         raise CalibrationFileError(
             "pose.reference_q_xyzw: expected a quaternion with tangent_reference and null with "
@@ -48,7 +48,7 @@ def _check_thresholds(thresholds: tuple[Threshold, ...]) -> None:
         if missing:
             raise CalibrationFileError(
                 f"thresholds: expected {', '.join(map(str, CONFIDENCES))} for scope {scope}, "
-                f"found none for {', '.join(map(str, missing))}"
+                f"missing {', '.join(map(str, missing))}"
             )
         entries = sorted(
             (entry for entry in thresholds if entry.scope == scope), key=lambda e: e.confidence
@@ -56,7 +56,7 @@ def _check_thresholds(thresholds: tuple[Threshold, ...]) -> None:
         for before, after in pairwise(entries):
             if after.confidence - before.confidence < 1e-9:
                 raise CalibrationFileError(
-                    f"thresholds: expected each confidence once a scope, found "
+                    f"thresholds: expected each confidence once per scope, found "
                     f"{after.confidence} ({scope}) twice"
                 )
             for side in ("q_hat", "q_hat_upper"):
@@ -72,14 +72,16 @@ def _check_monotone(
 ) -> None:
     if smaller is None or larger is None:
         if smaller is not larger:
-            raise CalibrationFileError(f"thresholds.{side}: expected null for all or for none")
+            raise CalibrationFileError(
+                f"thresholds.{side}: expected null in all thresholds of scope {scope} or in none"
+            )
         return
     for index, (low, high) in enumerate(zip(smaller, larger, strict=True)):
-        # None is unbounded, the largest of all.
+        # None means unbounded, which exceeds every number.
         if high is not None and (low is None or low > high):
             raise CalibrationFileError(
-                f"thresholds.{side}: expected growth with the confidence, found {low} before "
-                f"{high} at [{index}], confidence {entry.confidence}, {scope}"
+                f"thresholds.{side}: expected values that grow with the confidence, found {low} "
+                f"before {high} at [{index}], confidence {entry.confidence}, {scope}"
             )
 
 
@@ -96,7 +98,7 @@ def _check_model(calibration: Calibration) -> None:
     for tensors in (model.inputs, model.outputs):
         names = [spec.name for spec in tensors]
         if len(set(names)) != len(names):
-            raise CalibrationFileError(f"model: expected each tensor once, found {shown(names)}")
+            raise CalibrationFileError(f"model: expected unique tensor names, found {shown(names)}")
     sizes = {spec.name: math.prod(spec.shape) for spec in model.outputs}
     given = {name: len(values) for name, values in calibration.selftest.outputs.items()}
     if sizes != given:

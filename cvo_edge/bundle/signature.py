@@ -1,11 +1,11 @@
-"""Who made a bundle: an Ed25519 signature beside it, and versions that only grow on a device.
+"""Bundle signatures (Ed25519) and protection against older versions.
 
-Digests say that a bundle is whole, not whose it is. ``signature.json`` signs the sha256 of the
-whole ``calibration.json``, which names that of the model, with the bundle's name and a version. A
-device remembers the highest version of each name that it has run: an older bundle, however well
-signed, is not taken any more.
+Digests show that a bundle is intact, not who made it. ``signature.json`` signs the bundle's name, a
+version and the sha256 of ``calibration.json``, which contains the sha256 of the model. A device
+records the highest version that it has run of each name and rejects older ones, even if their
+signature is valid.
 
-Signatures are made and checked by ``cryptography`` (extra ``[sign]``); RFC 8032.
+Signatures follow RFC 8032 and need ``cryptography`` (extra ``[sign]``).
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ STATE_VARIABLE = "CVO_EDGE_STATE"
 _MAX_SIGNATURE_BYTES = 4096
 MAX_KEY_BYTES = 16384
 _UNDECODABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
-# Seconds since 1970 are versions, too, for a long time.
+# Large enough to use Unix timestamps as versions.
 HIGHEST_VERSION = 2**53
 
 
 class Signature(Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole of ``signature.json``.
+    """The contents of ``signature.json``.
 
-    ``key`` is the sha256 of the public key's 32 bytes, to say which one is needed; the signature
-    itself decides. ``signature`` is of ``message``, 64 bytes in hexadecimal digits.
+    ``key`` is the sha256 of the public key's 32 bytes; it tells which key is needed and proves
+    nothing. ``signature`` is the signature of ``message``, 64 bytes in hexadecimal digits.
     """
 
     schema_version: Literal[1]
@@ -54,15 +54,15 @@ class Signature(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def message(name: str, version: int, calibration_sha256: str) -> bytes:
-    """Return what is signed. A name has no line breaks, so that no two bundles share a message."""
+    """Return the signed bytes; names have no line breaks, so no two bundles share a message."""
     return f"cvo-edge bundle 1\n{name}\n{version}\n{calibration_sha256}\n".encode()
 
 
 @dataclass
 class Trust:
-    """Bundles signed with one key, in versions that this device has not gone beyond.
+    """Accept bundles that are signed with one key and not older than those this device has run.
 
-    ``accepted`` is name and version of the bundle that was checked last.
+    ``accepted`` is the name and version of the bundle that was checked last.
     """
 
     key: Ed25519PublicKey
@@ -71,9 +71,9 @@ class Trust:
 
     @classmethod
     def in_key(cls, path: Path) -> Trust:
-        """Read a public key (PEM), and use this device's record of versions.
+        """Read a public key from a PEM file, and use this device's record of versions.
 
-        Raises UsageError where it is no Ed25519 public key, or ``cryptography`` is not installed.
+        Raises UsageError if it is not an Ed25519 key or ``cryptography`` is not installed.
         """
         return cls(_public_key(path), Versions.default())
 
@@ -83,10 +83,10 @@ class Trust:
         return hashlib.sha256(self.key.public_bytes_raw()).hexdigest()
 
     def check(self, folder: Path, calibration: Calibration, content: bytes) -> None:
-        """Check the signature of these bytes of a ``calibration.json``, and the bundle's version.
+        """Check a bundle's signature and version; ``content`` holds its ``calibration.json``.
 
-        Raises BundleMismatchError for a bundle that is not signed, was altered after it, is signed
-        with another key, or is older than one that this device has run.
+        Raises BundleMismatchError if the bundle is not signed, was altered after signing, is signed
+        with another key, or is older than a version that this device has run.
         """
         from cryptography.exceptions import InvalidSignature
 
@@ -100,29 +100,28 @@ class Trust:
         found = hashlib.sha256(content).hexdigest()
         if (signature.calibration_sha256, signature.name) != (found, name):
             raise BundleMismatchError(
-                f"{path}: expected a signature of {name}, calibration.json with sha256 {found}, "
-                f"found one of {signature.name}, {signature.calibration_sha256}"
+                f"{path}: expected a signature for {name} with calibration.json sha256 {found}, "
+                f"found one for {signature.name} with {signature.calibration_sha256}"
             )
         signed = message(name, signature.version, found)
         try:
             self.key.verify(bytes.fromhex(signature.signature), signed)
         except InvalidSignature:
             raise BundleMismatchError(
-                f"{path}: expected a signature of {name} in version {signature.version}, found one "
-                "that does not fit it"
+                f"{path}: the signature is not valid for {name} version {signature.version}"
             ) from None
         highest = self.versions.highest(self.key_sha256, name)
         if signature.version < highest:
             raise BundleMismatchError(
-                f"{path}: expected version {highest} of {name} or a later one, as this device has "
-                f"run it, found {signature.version}"
+                f"{path}: expected version {highest} or later of {name}, because this device has "
+                f"run version {highest}, found {signature.version}"
             )
         self.accepted = name, signature.version
 
     def remember(self) -> None:
-        """Take no older version of the accepted bundle from now on.
+        """Record the accepted version, so that older ones are rejected from now on.
 
-        Raises SinkError where that cannot be written down.
+        Raises SinkError if the record cannot be written.
         """
         if self.accepted is not None:
             self.versions.raise_to(self.key_sha256, *self.accepted)
@@ -130,29 +129,29 @@ class Trust:
 
 @dataclass(frozen=True)
 class Versions:
-    """The highest version of each bundle by key and name, in a file of this device."""
+    """Record of the highest version that this device has run, by key and bundle name."""
 
     path: Path
 
     @classmethod
     def default(cls) -> Versions:
-        """``versions.json`` in ``$CVO_EDGE_STATE``, or in cvo-edge's folder of the user's state.
+        """Use ``versions.json`` in ``$CVO_EDGE_STATE``, or in the user's XDG state folder.
 
-        Raises UsageError for a relative path in that variable.
+        Raises UsageError if the variable holds a relative path.
         """
         folder = own_folder(STATE_VARIABLE, "XDG_STATE_HOME", "~/.local/state")
         return cls(folder / "versions.json")
 
     def highest(self, key: str, name: str) -> int:
-        """Return the highest version that was run, 0 if none was.
+        """Return the highest version that this device has run, or 0.
 
-        Raises BundleMismatchError where the file is there and cannot be understood: a record that
-        may be anything protects from nothing.
+        Raises BundleMismatchError if the file exists but is damaged: ignoring it would let older
+        versions run again.
         """
         return self._read().get(key, {}).get(name, 0)
 
     def raise_to(self, key: str, name: str, version: int) -> None:
-        """Put down a version, unless a higher one is; raises SinkError where it cannot be kept."""
+        """Record a version, unless a higher one is recorded; raises SinkError on failure."""
         if version <= self.highest(key, name):
             return
         try:
@@ -164,12 +163,12 @@ class Versions:
                 self._write(known)
         except OSError as error:
             raise SinkError(
-                f"{self.path}: the version that was run cannot be kept: {error.strerror}"
+                f"{self.path}: cannot record the bundle's version: {error.strerror}"
             ) from None
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
-        """Two processes do not read and write in turns; the lock ends with its process."""
+        """Lock out other processes during an update; the lock ends with the process."""
         with (self.path.parent / "versions.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield
@@ -181,19 +180,18 @@ class Versions:
             return {}
         except OSError as error:
             raise BundleMismatchError(
-                f"{self.path}: expected the versions that this device has run, found it "
-                f"unreadable: {error.strerror}"
+                f"{self.path}: cannot read the versions that this device has run: {error.strerror}"
             ) from None
         try:
             return msgspec.json.decode(content, type=dict[str, dict[str, int]])
         except _UNDECODABLE:
             raise BundleMismatchError(
-                f"{self.path}: expected the versions that this device has run, found something "
-                "else; without it, removed by hand, any version is taken once more"
+                f"{self.path}: the record of versions that this device has run is damaged; if you "
+                "delete it, older versions are accepted again"
             ) from None
 
     def _write(self, known: dict[str, dict[str, int]]) -> None:
-        """The whole new file or the old one, also after a loss of power."""
+        """Replace the file atomically, even if the power fails."""
         write_whole(self.path, json.dumps(known, indent=1), durable=True)
 
 
@@ -202,7 +200,7 @@ def _read_signature(path: Path) -> Signature:
     try:
         return msgspec.json.decode(content, type=Signature, strict=True)
     except _UNDECODABLE as error:
-        raise BundleMismatchError(f"{path}: expected a signature, found none: {error}") from None
+        raise BundleMismatchError(f"{path}: not a valid signature file: {error}") from None
 
 
 def _public_key(path: Path) -> Ed25519PublicKey:
@@ -212,15 +210,15 @@ def _public_key(path: Path) -> Ed25519PublicKey:
         from cryptography.hazmat.primitives.serialization import load_pem_public_key
     except ImportError:
         raise UsageError(
-            "public key: expected the extra [sign] (pip install 'cvo-edge[sign]'), found no "
-            "cryptography"
+            "public key: the package cryptography is not installed; run pip install "
+            "'cvo-edge[sign]'"
         ) from None
-    # Secrets are often mounted as links.
+    # Keys are often mounted as symbolic links.
     content = read_regular_file(path, MAX_KEY_BYTES, UsageError, links=True)
     try:
         key = load_pem_public_key(content)
     except (ValueError, TypeError, UnsupportedAlgorithm):
         key = None
     if not isinstance(key, Ed25519PublicKey):
-        raise UsageError(f"{path}: expected an Ed25519 public key in PEM form, found none")
+        raise UsageError(f"{path}: not an Ed25519 public key in PEM format")
     return key

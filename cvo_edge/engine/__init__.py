@@ -1,1 +1,1 @@
-"""Inference engines: sessions, the cache of prepared models, and opening a bundle with them."""
+"""Inference engines: sessions, the cache of prepared models, and loading a bundle."""

@@ -1,4 +1,4 @@
-"""Which processor cores this process may use, and which one each inference thread gets."""
+"""The processor cores that this process may use, and the core of each inference thread."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ MAX_THREADS = 64
 def allowed_cores() -> int:
     """Return the number of processor cores this process may use.
 
-    The smaller of its affinity and of its control group's quota, as containers have it; a part of a
-    core counts as one.
+    This is the smaller of its CPU affinity and its control group's quota (set for containers),
+    rounded up.
     """
     cores = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):
@@ -26,10 +26,10 @@ def allowed_cores() -> int:
 def cgroup_cores(
     groups: Path = Path("/proc/self/cgroup"), mount: Path = Path("/sys/fs/cgroup")
 ) -> float:
-    """Cores' worth of time that this process's control groups allow, infinite without a quota.
+    """Return the CPU quota of this process's control groups in cores; infinite without a quota.
 
-    ``groups`` names its groups, ``mount`` is where they are; of version 2, or of version 1 in the
-    folder ``cpu``.
+    ``groups`` is the file that lists the groups, ``mount`` the root of the cgroup file system
+    (version 2, or version 1 in the folder ``cpu``).
     """
     least = math.inf
     try:
@@ -42,7 +42,7 @@ def cgroup_cores(
             continue
         root = mount / "cpu" if controllers else mount
         group = PurePosixPath(path.lstrip("/"))
-        # A group has no more than each one that it is in.
+        # The quota of every parent group applies, too.
         for part in (group, *group.parents):
             least = min(least, _group_cores(root / part))
     return least
@@ -55,25 +55,25 @@ def _group_cores(folder: Path) -> float:
         else:
             quota = (folder / "cpu.cfs_quota_us").read_text("ascii")
             period = (folder / "cpu.cfs_period_us").read_text("ascii")
-        # "max" and -1 are no quota.
+        # "max" and -1 mean that there is no quota.
         return int(quota) / int(period) if int(quota) > 0 else math.inf
     except (OSError, ValueError, ZeroDivisionError):
         return math.inf
 
 
 def checked_threads(threads: int | None) -> int:
-    """Return a number of threads, by default one for each allowed core; raises UsageError."""
-    # The engine would take a thousand, and minutes for a frame.
+    """Return the number of threads, by default one per allowed core; raises UsageError."""
+    # The engine accepts a thousand threads, and then takes minutes per frame.
     if threads is not None and not (isinstance(threads, int) and 1 <= threads <= MAX_THREADS):
         raise UsageError(f"threads: expected 1 to {MAX_THREADS}, found {threads!r}")
     return threads or allowed_cores()
 
 
 def cores_of_threads(threads: int) -> list[int]:
-    """Return a core for each thread of an inference, or none where they had better be free.
+    """Return one core per inference thread, or an empty list to leave the threads unpinned.
 
-    Only where there are as many threads as cores. A thread that wakes up is often put on the core
-    of the one that woke it, while another is idle, and there they take turns.
+    Threads are pinned only if there are as many threads as cores. Without pinning, the scheduler
+    often runs a woken thread on the core of the thread that woke it while another core is idle.
     """
     if threads < 2 or not hasattr(os, "sched_getaffinity"):
         return []

@@ -1,4 +1,4 @@
-"""A bundle folder -> a checked bundle, and the engine that runs its model."""
+"""Read a bundle folder into a checked bundle, and open the engine that runs its model."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Bundle:
     Attributes
     ----------
     calibration
-        What ``calibration.json`` says.
+        The contents of ``calibration.json``.
     head
-        The method's score and set, made from it.
+        The method's score and set, built from the calibration.
     model
-        The bytes whose sha256 the calibration names, or the form of that model that a cache has
-        prepared for this machine.
+        The model's bytes, whose sha256 matches the calibration, or the same model as prepared for
+        this machine by a cache.
     """
 
     calibration: Calibration
@@ -39,14 +39,14 @@ class Bundle:
 
     @classmethod
     def of(cls, calibration: Calibration, model: bytes | PreparedModel) -> Bundle:
-        """Check a calibration against its method; raises as ``read_bundle``."""
+        """Check a calibration against its method, as ``read_bundle`` does, and build a bundle."""
         return cls(calibration, checked_head(calibration), model)
 
     @property
     def model_bytes(self) -> bytes:
-        """The model itself; raises UsageError where the bundle holds a prepared form of it."""
+        """The model's bytes; raises UsageError if the bundle holds a prepared model instead."""
         if isinstance(self.model, PreparedModel):
-            raise UsageError("bundle: expected one read without a cache, found a prepared model")
+            raise UsageError("bundle: holds a prepared model only; read it without a cache")
         return self.model
 
     def __repr__(self) -> str:
@@ -68,13 +68,12 @@ def read_bundle(
     Parameters
     ----------
     folder
-        With ``model.onnx`` and ``calibration.json``.
+        Folder with ``model.onnx`` and ``calibration.json``.
     cache
-        Takes the model from this cache, prepared for this machine, and puts it there the first
-        time. The bundle holds the model's bytes where the cache cannot be used, and for a provider
-        other than onnxruntime.
+        Cache of models prepared for this machine; the first call for a model fills it. If the cache
+        cannot be used, or the provider is not onnxruntime, the bundle holds the model's bytes.
     check
-        What else must hold, e.g. a signature; called before the model is read.
+        An additional check, e.g. of a signature; called before the model is read.
 
     Raises
     ------
@@ -83,8 +82,8 @@ def read_bundle(
     ModelError
         ``model.onnx`` is missing, not a regular file or too large.
     BundleMismatchError
-        The model is not the one that was calibrated, whatever the cache holds, or its tensors are
-        not those of the method; and what ``check`` raises.
+        ``model.onnx`` is not the calibrated model, even if the cache holds that one, or its tensors
+        do not match the method. ``check`` may raise other errors.
     """
     path = Path(folder)
     calibration, content = read_calibration_file(path)
@@ -102,7 +101,7 @@ def read_bundle(
 
 
 def prepared_model(cache: ModelCache, calibration: Calibration) -> PreparedModel | None:
-    """Return what the cache has of a calibration's model; only models of onnxruntime are cached."""
+    """Return the cached model of a calibration, or None; only onnxruntime models are cached."""
     if calibration.model.provider != "onnxruntime":
         return None
     return cache.find(calibration.model.sha256)
@@ -111,10 +110,10 @@ def prepared_model(cache: ModelCache, calibration: Calibration) -> PreparedModel
 def _check_original(
     folder: Path, calibration: Calibration, cache: ModelCache, prepared: PreparedModel
 ) -> None:
-    """Raise BundleMismatchError where the bundle's own model file is not the calibrated one.
+    """Raise BundleMismatchError if the bundle's own model file is not the calibrated one.
 
-    What runs is the cache's entry, whose files were checked: this tells of a model that was
-    swapped. A file that has not changed since its digest was last taken is not read again.
+    The cache entry that runs was checked separately; this check reports a replaced ``model.onnx``.
+    A file that has not changed since its last check is not read again.
     """
     model = folder / MODEL_FILE
     if not cache.knows(prepared, model):
@@ -126,7 +125,7 @@ def _check_original(
 def _prepared_now(
     calibration: Calibration, model: bytes, cache: ModelCache
 ) -> PreparedModel | None:
-    """Build the entry; None where it cannot be kept or does not compute exactly the same."""
+    """Build a cache entry; None if it cannot be stored or its results are not bit-identical."""
     new = cache.new_folder()
     if new is None:
         return None
@@ -135,10 +134,10 @@ def _prepared_now(
         plain = Session(model, 1, spec, keep_in=new)
         expected = plain.run(_feeds(spec.inputs))
     except (ModelError, BundleMismatchError):
-        # The disk may be full. A model that is itself refused is refused again without the cache.
+        # The disk may be full. A model that the engine refuses is reported without the cache.
         cache.discard(new)
         return None
-    # Two models in memory at once would be the peak of the whole run.
+    # Two models in memory at once would set the peak of the whole run.
     del plain
     cache.keep(new, calibration.name, spec.sha256)
     prepared = cache.find(spec.sha256)
@@ -157,7 +156,7 @@ def _same(prepared: PreparedModel, spec: ModelSpec, expected: dict[str, np.ndarr
 
 
 def _feeds(inputs: tuple[TensorSpec, ...]) -> dict[str, np.ndarray]:
-    """Values for every input: rings as the image, ones elsewhere."""
+    """Return values for every input: the self-test image, and ones for other inputs."""
     return {
         spec.name: preprocess.selftest_image(*spec.shape[1:3])[np.newaxis]
         if spec.dtype == "uint8"
@@ -174,21 +173,21 @@ def open_session(
     spinning: bool = True,
     at_once: int = 1,
 ) -> Session:
-    """Open a session of the provider that a calibration is about.
+    """Open a session of the provider that the calibration names.
 
-    ``at_once`` is the number of threads that will call it at the same time; the rest as in
-    ``Session``. Raises BundleMismatchError for a prepared model that was made of another model.
+    ``at_once`` is the number of threads that call the session concurrently; see ``Session`` for the
+    other parameters. Raises BundleMismatchError if a prepared model was built from another model.
     """
     if isinstance(model, PreparedModel) and (model.model_sha256, "onnxruntime") != (
         expected.sha256,
         expected.provider,
     ):
         raise BundleMismatchError(
-            f"prepared model: expected one of {expected.sha256} on {expected.provider}, found one "
-            f"of {model.model_sha256} on onnxruntime"
+            f"prepared model: expected sha256 {expected.sha256} for {expected.provider}, found "
+            f"{model.model_sha256} for onnxruntime"
         )
     if expected.provider == "openvino" and not isinstance(model, PreparedModel):
-        # An optional package, and not a small one.
+        # Imported here because the package is optional and large.
         from cvo_edge.engine.openvino import OpenvinoSession
 
         return OpenvinoSession(model, threads, expected, at_once=at_once)

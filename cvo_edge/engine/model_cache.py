@@ -1,11 +1,11 @@
-"""PreparedModel models: what onnxruntime makes of a model on this machine, built once and kept.
+"""Cache of prepared models: what onnxruntime builds from a model on this machine.
 
-Loading a model means parsing it, rewriting its graph for this processor and laying out its weights
-anew. The result is kept as a folder of two files: the rewritten graph, and its weights, which the
-system maps into memory and shares between processes. An entry belongs to one model, one release of
-onnxruntime and one processor, and is used only while every byte of it is what was written.
+Loading a model means parsing it, optimising its graph for this processor and rearranging its
+weights. The cache stores the result as a folder of two files: the optimised graph, and its weights,
+which the system maps into memory and shares between processes. An entry belongs to one model, one
+release of onnxruntime and one processor, and is used only if its bytes are unchanged.
 
-Nothing here may keep a model from running: what goes wrong with the cache costs its advantage only.
+A failure of the cache never stops a model from running: it only makes the start slower.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
 SEEN_FILE = "seen.json"
 CACHE_VARIABLE = "CVO_EDGE_CACHE"
 
-# What a core's own cache holds.
+# Fits into the private cache of a core.
 _CHUNK_BYTES = 1 << 20
 _UNFINISHED = ".unfinished-"
 _ENTRY_NAME = re.compile("[0-9a-f]{32}")
-# A build takes seconds: what is older was interrupted.
+# A build takes seconds; an unfinished folder older than this was interrupted.
 _STALE_SECONDS = 3600.0
-# A file that changed less than this ago may change again without a sign: clocks tick slowly.
+# File times are coarse: a file changed more recently than this may change again unnoticed.
 _SETTLED_NS = 2_000_000_000
-# What msgspec raises at bytes that it did not write.
+# Errors that msgspec raises for damaged or foreign content.
 _UNDECODABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
-# With these nothing is wrong with an entry: it may be read later.
+# Errors that say nothing about the entry itself; reading it later may succeed.
 _PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EACCES)
-# Of what is kept, and of the settings it was made with; another one is another entry.
+# Version of the entry's format and build settings; part of the entry's key.
 _FORM = "4"
-# Copies of a bundle on one machine.
+# Checked model files remembered per entry, e.g. several copies of a bundle.
 _MOST_SEEN = 16
 
 
 class Entry(Struct, frozen=True, forbid_unknown_fields=True):
-    """``entry.json``: what was prepared, by what, for what, and what both files hold."""
+    """``entry.json``: model, onnxruntime release, processor, and digests of both files."""
 
     name: str
     model_sha256: str
@@ -65,7 +65,7 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FileIdentity(Struct, frozen=True, array_like=True):
-    """What the system says of a file; its ``ctime_ns`` moves with every change of it."""
+    """File metadata that reveals a change; ``ctime_ns`` advances with every change."""
 
     device: int
     inode: int
@@ -76,7 +76,7 @@ class FileIdentity(Struct, frozen=True, array_like=True):
 
 @dataclass(frozen=True)
 class PreparedModel:
-    """An entry whose bytes were checked: the graph itself, and the folder with its weights."""
+    """A checked cache entry: the bytes of the graph, and the folder with the weights."""
 
     folder: Path
     graph: bytes
@@ -84,7 +84,7 @@ class PreparedModel:
 
 
 class Listed(Struct, frozen=True):
-    """One line of ``cvo-edge cache``; ``current`` says whether this machine would use it."""
+    """One line of ``cvo-edge cache``; ``current`` tells whether this machine can use it."""
 
     name: str
     model_sha256: str
@@ -99,7 +99,7 @@ class ModelCache:
     Parameters
     ----------
     folder
-        Made when the first model is kept. One that others may write to is not used.
+        Created when the first model is stored. Not used if other users may write to it.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -107,17 +107,14 @@ class ModelCache:
 
     @classmethod
     def default(cls) -> ModelCache:
-        """The cache in ``$CVO_EDGE_CACHE``, else in ``cvo-edge`` of the user's own caches.
+        """Use ``$CVO_EDGE_CACHE``, or ``cvo-edge`` in the user's XDG cache folder.
 
-        Raises UsageError for a relative path in that variable.
+        Raises UsageError if the variable holds a relative path.
         """
         return cls(own_folder(CACHE_VARIABLE, "XDG_CACHE_HOME", "~/.cache"))
 
     def find(self, model_sha256: str) -> PreparedModel | None:
-        """Return the entry of a model if this machine has one and its bytes are unchanged.
-
-        A changed one is removed.
-        """
+        """Return the entry of a model, or None; a changed entry is removed."""
         if self.obstacle() is not None:
             return None
         folder = self._entry_folder(model_sha256)
@@ -142,11 +139,11 @@ class ModelCache:
         return None
 
     def knows(self, prepared: PreparedModel, model: Path) -> bool:
-        """Whether this very model file has had its digest taken, and has not changed since."""
+        """Whether this model file is unchanged since its digest was checked."""
         return identity(model) in _seen(prepared)
 
     def remember(self, prepared: PreparedModel, model: Path, before: FileIdentity | None) -> None:
-        """Note a model file whose digest was right; ``before`` is what it was before that."""
+        """Record a model file whose digest matched; ``before`` is its identity before the check."""
         if before is None or before != identity(model):
             return
         if time.time_ns() - max(before.ctime_ns, before.mtime_ns) < _SETTLED_NS:
@@ -156,7 +153,7 @@ class ModelCache:
             write_whole(prepared.folder / SEEN_FILE, msgspec.json.encode(seen))
 
     def new_folder(self) -> Path | None:
-        """Return a folder to write an entry's files to; None where none can be made."""
+        """Create a folder for the files of a new entry; None if that is impossible."""
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             if self.obstacle() is not None:
@@ -167,9 +164,9 @@ class ModelCache:
             return None
 
     def keep(self, new: Path, name: str, model_sha256: str) -> None:
-        """Make an entry of a new folder's two files, unless another process was faster.
+        """Turn a new folder into an entry, unless another process was faster.
 
-        The folder is gone afterwards, whatever happened.
+        The new folder no longer exists afterwards, even on failure.
         """
         try:
             entry = Entry(
@@ -181,7 +178,7 @@ class ModelCache:
                 weights_sha256=file_digests(new / WEIGHTS_FILE),
             )
             (new / ENTRY_FILE).write_bytes(msgspec.json.encode(entry))
-            # Whole or not at all; a folder that is there and not empty is left as it is.
+            # The rename is atomic and fails if the entry already exists.
             new.rename(self._entry_folder(model_sha256))
         except OSError:
             pass
@@ -197,14 +194,14 @@ class ModelCache:
         shutil.rmtree(self._entry_folder(model_sha256), ignore_errors=True)
 
     def entries(self) -> list[Listed]:
-        """Return what the cache holds, in order of its names."""
+        """Return the entries, sorted by name."""
         found = []
         for folder in self._folders():
             entry = _read_entry(folder)
             if entry is None:
                 continue
             size = 0
-            # What another process has just removed has no size.
+            # Another process may remove the entry at the same time.
             with contextlib.suppress(OSError):
                 size = sum(path.lstat().st_size for path in folder.iterdir())
             found.append(
@@ -219,7 +216,7 @@ class ModelCache:
         return sorted(found, key=lambda listed: (listed.name, listed.model_sha256))
 
     def clear(self) -> int:
-        """Remove every entry and what interrupted builds left; returns how many entries."""
+        """Remove all entries and interrupted builds; returns the number of entries removed."""
         count = 0
         for folder in self._folders():
             shutil.rmtree(folder, ignore_errors=True)
@@ -227,7 +224,7 @@ class ModelCache:
         return count
 
     def obstacle(self) -> str | None:
-        """Say why this cache is not used; None where it is, or could be made."""
+        """Return why this cache cannot be used, or None if it can."""
         try:
             found = self.folder.stat()
         except FileNotFoundError:
@@ -235,15 +232,15 @@ class ModelCache:
         except OSError as error:
             return f"cannot be read: {error.strerror}"
         if not stat.S_ISDIR(found.st_mode):
-            return "expected a folder, found another kind"
+            return "not a folder"
         if found.st_uid != os.getuid() or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-            return "expected a folder of this user's that nobody else may write to"
+            return "must belong to this user and be writable only by this user"
         if not os.access(self.folder, os.R_OK | os.W_OK | os.X_OK):
-            return "expected a folder that may be written to"
+            return "no permission to read from and write to this folder"
         return None
 
     def _folders(self) -> list[Path]:
-        """Folders of ours: a cache that someone put elsewhere may lie among other files."""
+        """Return only folders that the cache created: the folder may hold other files, too."""
         if self.obstacle() is not None or not self.folder.exists():
             return []
         return [
@@ -263,7 +260,7 @@ class ModelCache:
 
 
 def _is_entry(folder: Path) -> bool:
-    """Whether a folder has the name of an entry and holds nothing else, whole or damaged."""
+    """Whether a folder is named like an entry and holds only an entry's files."""
     ours = (GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE, SEEN_FILE)
     return (
         _ENTRY_NAME.fullmatch(folder.name) is not None
@@ -280,7 +277,7 @@ def _read_entry(folder: Path) -> Entry | None:
 
 
 def identity(path: Path) -> FileIdentity | None:
-    """Return what the system says of a regular file, None where there is none."""
+    """Return the metadata of a regular file, or None if it is missing or not regular."""
     try:
         found = path.lstat()
     except OSError:
@@ -300,7 +297,7 @@ def _seen(prepared: PreparedModel) -> list[FileIdentity]:
 
 
 def _opened(path: Path) -> io.FileIO:
-    """Open a regular file; neither links are followed nor pipes waited for."""
+    """Open a regular file, without following links or waiting for pipes."""
     stream = io.FileIO(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK))
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
@@ -314,7 +311,7 @@ def _content(path: Path) -> bytes:
 
 
 def file_digests(path: Path) -> list[str]:
-    """Sha256 of each MiB of a file, by all cores beside each other; raises OSError."""
+    """Return the sha256 of each MiB of a file, using all cores in parallel; raises OSError."""
     with _opened(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         workers = os.cpu_count() or 1
@@ -336,15 +333,15 @@ def file_digests(path: Path) -> list[str]:
 
 
 def _onnxruntime_version() -> str:
-    # Not at the top: a cache is cleared without the engine. Asking the installed
-    # package's metadata instead takes as long as opening a small model.
+    # Imported here because clearing the cache does not need the engine. Reading the version from
+    # the package metadata instead takes as long as opening a small model.
     from onnxruntime import __version__ as version
 
     return str(version)
 
 
 def _processor() -> str:
-    """What decides the layout of weights: architecture, and what the processor can do."""
+    """Return a digest of the architecture and CPU features, which determine the weight layout."""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
     except OSError:

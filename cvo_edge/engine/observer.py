@@ -1,6 +1,6 @@
-"""Camera image -> what the network says of it: model input, outputs, pose, and whether they count.
+"""Camera image -> observation: model input, outputs, pose, and results of the frame checks.
 
-Nothing here needs a threshold: calibration observes frames before there is one.
+Nothing here needs a threshold, because calibration observes frames before thresholds exist.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from cvo_edge.pose import Chart
 
 Array = NDArray[np.float64]
 
-# Python looks at so few numbers in less time than numpy's first call takes.
+# Up to this size, a plain Python loop is faster than the first numpy call.
 _FEW = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What the network says of one image, before any threshold.
+    """The network's results for one image, before any threshold is applied.
 
     Attributes
     ----------
     outputs
-        By name, each with a leading axis of one.
+        Model outputs by name, each with a leading axis of one.
     pose, point
-        Shape (7,), with a unit quaternion, and (6,), the same pose in the bundle's chart.
+        Shape (7,) with a unit quaternion, and shape (6,): the same pose in the bundle's chart.
     fault
-        Why none of these may be used; None where they may.
+        Why these results must not be used, or None.
     doubt
-        Why no interval may be claimed; None where one may.
+        Why no interval may be claimed, or None.
     look
-        What the stream checks need of the image; None where there is no image.
+        Image data for the stream checks, or None if there is no image.
     """
 
     outputs: Mapping[str, NDArray[np.float32]]
@@ -68,20 +68,20 @@ class Observer:
     model
         The model's bytes, or its prepared form.
     spec, inputs, pose
-        What the calibration says of the model, of its input and of the poses.
+        The calibration's description of the model, its input and the poses.
     head
-        The method, which may ask for inputs besides the image.
+        The method, which may need inputs besides the image.
     threads
         Threads of one inference; all allowed cores by default.
     spinning
-        Whether these threads wait for one another at full speed.
+        Whether these threads busy-wait for each other.
     at_once
-        Number of threads that call ``observe`` at the same time.
+        Number of threads that call ``observe`` concurrently.
 
     Raises
     ------
     ModelError, BundleMismatchError
-        The engine refuses the model, or it is not the one that ``spec`` describes.
+        The engine refuses the model, or the model does not match ``spec``.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Observer:
         reference = None if pose.reference_q_xyzw is None else np.array(pose.reference_q_xyzw)
         absolute = pose.rotation == "tangent_reference"
         self.chart = Chart(pose.rotation, reference if absolute else None)
-        # A prediction is the origin of its own tangent: what is plausible needs a fixed one.
+        # Every prediction is the origin of its own tangent space: limits need a fixed origin.
         self._limits_chart = self.chart
         if reference is not None and pose.rotation == "tangent_predicted":
             self._limits_chart = Chart("tangent_reference", reference)
@@ -124,29 +124,29 @@ class Observer:
         self.close()
 
     def close(self) -> None:
-        """Give back the model's memory; closing twice is harmless."""
+        """Release the model's memory; a second call has no effect."""
         self.session = None
 
     def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
-        """Run the network on one image; frame checks report in ``fault`` and ``doubt``.
+        """Run the network on one image; ``fault`` and ``doubt`` report failed checks.
 
         Parameters
         ----------
         image_bgr
-            As ``Odometer.step`` takes it.
+            As for ``Odometer.step``.
         seq
-            Number of the frame, which seeds the noise of a method that draws some.
+            Number of the frame; seeds the noise input of methods that have one.
 
         Raises
         ------
         UsageError
-            After ``close``, and in a forked process.
+            The observer is closed, or the process was forked after loading.
         ModelError
-            The engine failed.
+            Inference failed.
         """
         session = self.session
         if session is None:
-            raise UsageError("Odometer: expected an open one, found it closed")
+            raise UsageError("the odometer is closed; load it again")
         if image_bgr is None:
             return _faulty(Reason.IMAGE_UNREADABLE)
         start = perf_counter()
@@ -167,17 +167,17 @@ class Observer:
     def _checked(
         self, outputs: Mapping[str, NDArray[np.float32]]
     ) -> tuple[Array, Array, Reason | None]:
-        """Outputs -> unit pose (7,) and point (6,), and what is wrong with them.
+        """Outputs -> unit pose (7,), point (6,), and the fault or None.
 
-        The network has just driven everything else out of the processor's caches: a few numbers
-        are cheaper one by one in Python than by several calls into numpy.
+        For so few numbers plain Python is faster than numpy, whose code the inference has just
+        evicted from the processor's caches.
         """
         values = outputs["pose"][0].tolist()
         sensible = all(map(_sensible, outputs.values()))
         if not sensible and not all(np.isfinite(output).all() for output in outputs.values()):
             return np.array(values), np.array(values[:6]), Reason.OUTPUT_NOT_FINITE
         length = math.hypot(*values[3:])
-        # Unit, and of the two quaternions of a rotation the one with qw >= 0.
+        # Normalised, with the sign that gives qw >= 0.
         scale = math.copysign(length, values[6]) if length > 0.0 else math.nan
         pose = np.array([*values[:3], *(value / scale for value in values[3:])])
         point = plausible = self.chart.point(pose)
@@ -196,11 +196,11 @@ class Observer:
 
 
 def _sensible(output: NDArray[np.float32]) -> bool:
-    """Whether all numbers are there and none is absurd."""
+    """Whether all numbers are finite and of plausible size."""
     if output.size > _FEW:
         return bool(np.abs(output).max() < MAX_NUMBER)
     values = output.ravel().tolist()
-    # A sum keeps NaN wherever it stands, a maximum only where it comes first.
+    # max() may miss a NaN that is not the first value; sum() does not.
     return max(map(abs, values)) < MAX_NUMBER and not math.isnan(sum(values))
 
 

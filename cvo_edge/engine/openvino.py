@@ -1,7 +1,7 @@
-"""The only file that knows OpenVINO, the provider of bundles that were calibrated on it.
+"""Inference with OpenVINO, for bundles that were calibrated with it.
 
-Faster than onnxruntime in 8 bits on some processors (``docs/performance.md``), and never with the
-thresholds of the other: their 8-bit numbers differ.
+In 8 bits it is faster than onnxruntime on some processors (``docs/performance.md``). Thresholds
+cannot be shared between the two, because their 8-bit results differ.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from cvo_edge.errors import ModelError
 
 
 class OpenvinoSession(Session):
-    """One loaded model; parameters, attributes and errors as ``Session`` has them.
+    """One loaded model; parameters, attributes and errors are those of ``Session``.
 
-    ``at_once`` is the number of threads that call it at the same time, each with ``threads`` of its
-    own.
+    ``at_once`` is the number of threads that call it concurrently; each call uses ``threads``
+    threads.
     """
 
     def __init__(
@@ -31,28 +31,28 @@ class OpenvinoSession(Session):
     ) -> None:
         try:
             from openvino import Core, Type
-        # Of an older release, or of what is left of one, whatever it happens to raise.
+        # An older or incomplete installation may raise any exception.
         except Exception as error:
             raise ModelError(
-                "model.provider: expected the package openvino, 2026.4 or newer, found "
-                f'{one_line(error)}; pip install "cvo-edge[openvino]"'
+                "model.provider: the bundle needs openvino 2026.4 or newer, but its import failed: "
+                f'{one_line(error)}; run pip install "cvo-edge[openvino]"'
             ) from None
-        # It reads what a model names as external data, from whatever folder the process is in; a
-        # session of onnxruntime refuses such a model.
+        # OpenVINO would read files that a model names as external data from the current folder;
+        # an onnxruntime session refuses such a model.
         Session(model, 1, expected)
         self.threads = checked_threads(threads)
         settings = {
             "PERFORMANCE_HINT": "LATENCY" if at_once == 1 else "THROUGHPUT",
             "NUM_STREAMS": at_once,
             "INFERENCE_NUM_THREADS": self.threads * at_once,
-            # Left to itself it computes in bfloat16 where the processor can.
+            # By default OpenVINO computes in bfloat16 if the processor supports it.
             "INFERENCE_PRECISION_HINT": Type.f32,
         }
         try:
             core = Core()
             self.engine = core.compile_model(core.read_model(model=model), "CPU", settings)
             precision = self.engine.get_property("INFERENCE_PRECISION_HINT")
-        # Every failure is a RuntimeError there, of many lines; what it is about follows the places.
+        # OpenVINO raises a RuntimeError of many lines; the cause follows the list of locations.
         except Exception as error:
             summary = str(error).rpartition("Summary:")[2]
             raise ModelError(f"model.onnx: refused by OpenVINO: {one_line(summary)}") from None

@@ -1,6 +1,6 @@
-"""The only file that knows onnxruntime: a model -> a session that checks what it is.
+"""Inference with onnxruntime: a session that checks the model it loads.
 
-Bundles of another provider have their session in a file of its own, behind the same calls.
+Other providers implement the same interface in their own modules.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from cvo_edge.engine.cores import checked_threads, cores_of_threads
 from cvo_edge.engine.model_cache import GRAPH_FILE, WEIGHTS_FILE, PreparedModel
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 
-# No word of it leaves this machine.
+# Nothing is sent over the network.
 onnxruntime.disable_telemetry_events()
 
-# Smaller ones stay in the graph: shapes and scales, of no size.
+# Smaller tensors, such as shapes and scales, stay in the graph file.
 _SMALL_TENSOR = 1024
 
-# As onnxruntime and as OpenVINO has them.
+# Type names of onnxruntime and of OpenVINO.
 _DTYPES: dict[str, Dtype] = {
     "tensor(uint8)": "uint8",
     "tensor(float)": "float32",
@@ -37,7 +37,7 @@ _DTYPES: dict[str, Dtype] = {
     "f32": "float32",
 }
 
-# What a model declares of an input or output: name, type, and shape, whose sizes may be no numbers.
+# Name, type and shape of an input or output as declared; symbolic sizes are not integers.
 Port = tuple[str, str, Sequence[Any]]
 
 
@@ -52,11 +52,11 @@ _PRODUCT = (
 
 @cache
 def saturates() -> bool:
-    """Whether sums of 8-bit products overflow on this processor, in silence, in half a millisecond.
+    """Whether sums of 8-bit products saturate silently on this processor; takes half a millisecond.
 
-    They do on x86 without VNNI, unless a session is told to be precise, which costs half of the
-    speed where it is not needed. Asked by multiplying, as lists of what processors can do are not
-    the same as what an engine makes of it.
+    They do on x86 without VNNI, unless a session option forces precise sums, which halves the speed
+    on processors that do not need it. The test multiplies, because CPU feature lists do not tell
+    which kernels the engine uses.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
@@ -68,15 +68,15 @@ def saturates() -> bool:
     return int(found[0, 0]) != 32 * 255 * 127
 
 
-# Of this process, whichever thread holds them.
+# Open sessions of this process.
 _OPEN: WeakSet[Session] = WeakSet()
 
 
 def _abandon() -> None:
-    """Give up the sessions of the process that this one was forked from.
+    """Disable, in a forked process, the sessions of its parent.
 
-    Their threads were not forked with them: to run one may wait for ever, and so does to end one,
-    in a destructor, which is why these objects are never freed.
+    Their threads do not exist in the child, so running or destroying such a session may block
+    forever; therefore these objects are never freed.
     """
     for session in _OPEN:
         session.forked = True
@@ -93,26 +93,26 @@ class Session:
     Parameters
     ----------
     model
-        The model itself, never a path: what was digest-checked is what runs, and a model cannot
-        reach for other files. Or what a cache has of it.
+        The model's bytes or a prepared model, never a path: the bytes that run are those whose
+        digest was checked, and a model cannot open other files.
     threads
         Threads of one inference; all allowed cores by default.
     expected
-        What the calibration says of inputs and outputs; None to take the model as it is.
+        The calibration's description of inputs and outputs; None skips the comparison.
     spinning
-        Whether threads wait for each other at full speed within an inference: faster, for more
+        Whether threads busy-wait for each other within an inference: faster, but uses more
         processor time.
     keep_in
-        Folder to which the prepared model is written, for a cache.
+        Folder that the prepared model is written to, for a cache.
 
     Attributes
     ----------
     engine
-        The bare ``onnxruntime.InferenceSession``, for benchmarks beside it.
+        The bare ``onnxruntime.InferenceSession``, for comparison in benchmarks.
     inputs, outputs
-        What the model itself declares.
+        The tensors that the model declares.
     forked
-        Whether this is a process that was forked from the one that loaded it, where it cannot run.
+        Whether this process was forked from the one that loaded the model; it cannot run it.
 
     Raises
     ------
@@ -136,17 +136,17 @@ class Session:
         options.intra_op_num_threads = self.threads
         options.inter_op_num_threads = 1
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
-        # Threads that spin between frames cost four times the processor time at camera rate; this
-        # keeps the speed inside one call and gives the cores back after it.
+        # Spinning between frames uses four times the processor time at camera rate. This option
+        # keeps the speed within a call and releases the cores after it.
         options.add_session_config_entry("session.force_spinning_stop", "1")
         options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
         self._caller_core: set[int] = set()
         cores = cores_of_threads(self.threads)
         if cores:
-            # All but the caller's, and counted from one.
+            # All cores but the caller's; onnxruntime counts them from one.
             others = ";".join(str(core + 1) for core in cores[1:])
             options.add_session_config_entry("session.intra_op_thread_affinities", others)
-            # Where threads rest while they wait, the system finds the caller a better core.
+            # If threads sleep while they wait, the scheduler places the caller better.
             self._caller_core = {cores[0]} if spinning else set()
         options.log_severity_level = 4
         if keep_in is not None:
@@ -158,15 +158,15 @@ class Session:
             content, weights = model.graph, str(model.folder)
             options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         else:
-            # Else it takes what a model names as external data from the folder the process is in.
+            # By default, a model's external data would be read from the current folder.
             content, weights = model, os.devnull
-            # Whatever the calibration says of the model. What is prepared has it in its graph.
+            # Set for every precision; the graph of a prepared model already includes it.
             if saturates():
                 options.add_session_config_entry("session.x64quantprecision", "1")
         key = "session.model_external_initializers_file_folder_path"
         options.add_session_config_entry(key, weights)
         try:
-            # Without the fallback, which says on stdout that it loads the same model once more.
+            # The fallback would print to stdout and load the same model again.
             self.engine = onnxruntime.InferenceSession(
                 content, options, providers=["CPUExecutionProvider"], enable_fallback=0
             )
@@ -174,7 +174,7 @@ class Session:
                 [(each.name, each.type, each.shape) for each in ports]
                 for ports in (self.engine.get_inputs(), self.engine.get_outputs())
             )
-        # onnxruntime raises a dozen unrelated types here, UnicodeDecodeError among them.
+        # onnxruntime raises a dozen unrelated types here, including UnicodeDecodeError.
         except Exception as error:
             raise ModelError(f"model.onnx: refused by onnxruntime: {one_line(error)}") from None
         self._declare(inputs, outputs, expected)
@@ -182,7 +182,7 @@ class Session:
     def _declare(
         self, inputs: Sequence[Port], outputs: Sequence[Port], expected: ModelSpec | None
     ) -> None:
-        """Keep what the model itself declares, unless it is not what is expected."""
+        """Store the declared tensors, after comparing them with the expected ones."""
         self.inputs, self.outputs = _tensors(inputs, "input"), _tensors(outputs, "output")
         if expected is not None:
             _compare("inputs", expected.inputs, self.inputs)
@@ -195,22 +195,22 @@ class Session:
     def run(self, feeds: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.float32]]:
         """Input arrays by name -> output arrays by name.
 
-        Raises ModelError where it fails, and UsageError in a process forked from its own.
+        Raises ModelError if inference fails, and UsageError in a forked process.
         """
         if self.forked:
             raise UsageError(
-                "session: expected the process that loaded the model, found one forked from it; "
-                "load it there"
+                "session: this process was forked after the model was loaded; load it again in "
+                "this process"
             )
         try:
             values = self._call(feeds)
         except Exception as error:
             raise ModelError(f"model.onnx: inference failed: {one_line(error)}") from None
-        # A model may declare one shape and give another.
+        # A model may declare one shape and return another.
         for name, shape, value in zip(self._names, self._shapes, values, strict=True):
             if value.shape != shape:
                 raise ModelError(
-                    f"model.onnx: expected {name} {list(shape)}, as declared, found "
+                    f"model.onnx: expected the declared shape {list(shape)} for {name}, found "
                     f"{list(value.shape)}"
                 )
         return dict(zip(self._names, values, strict=True))
@@ -219,12 +219,12 @@ class Session:
         """Input arrays by name -> output arrays in the order of ``outputs``."""
         if not self._caller_core:
             return self.engine.run(None, feeds)  # type: ignore[no-any-return]
-        # The calling thread is on the core that no other thread of ours has.
+        # The calling thread runs on the one core that no inference thread is pinned to.
         before = os.sched_getaffinity(0)
         try:
             os.sched_setaffinity(0, self._caller_core)
         except OSError:
-            # Someone has taken the core away since.
+            # This process may no longer use that core.
             self._caller_core = set()
         try:
             return self.engine.run(None, feeds)  # type: ignore[no-any-return]
@@ -239,7 +239,7 @@ def _tensors(ports: Sequence[Port], kind: str) -> tuple[TensorSpec, ...]:
     for name, type_name, shape in ports:
         if type_name not in _DTYPES or not all(isinstance(size, int) for size in shape):
             raise BundleMismatchError(
-                f"model.onnx: expected {kind}s of uint8 or float32 with fixed shapes, "
+                f"model.onnx: expected uint8 or float32 {kind}s with fixed shapes, "
                 f"found {name} {type_name} {list(shape)}"
             )
         tensors.append(TensorSpec(name=name, dtype=_DTYPES[type_name], shape=tuple(shape)))
@@ -263,6 +263,6 @@ def _listed(tensors: tuple[TensorSpec, ...]) -> str:
 
 
 def one_line(error: Exception | str) -> str:
-    """Return what an engine says as one line of bounded length."""
+    """Return an engine's message as one line of bounded length."""
     line = " ".join(str(error).split())
     return line if len(line) <= 200 else line[:197] + "..."

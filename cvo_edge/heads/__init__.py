@@ -1,7 +1,7 @@
-"""One conformal method a file: its nonconformity score and the inverse, from threshold to set.
+"""One conformal method per file: its nonconformity score, and its inverse (threshold to set).
 
-``HEADS`` is the registry: a new method is one file here, one of the same name on the training
-side, and one line in each registry.
+``HEADS`` is the registry. A new method needs one file here, one file of the same name on the
+training side, and one line in each registry.
 """
 
 from __future__ import annotations

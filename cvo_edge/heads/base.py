@@ -1,4 +1,4 @@
-"""What every conformal method provides, to the odometer, to calibration and to reports."""
+"""The interface of a conformal method for the odometer, calibration and reports."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Candidate(NamedTuple):
 
 
 class Head(ABC):
-    """One method: its nonconformity score, the inverse (threshold to set), and what to say of it.
+    """One method: its nonconformity score, the inverse (threshold to set), and its description.
 
-    Scores have the shape (n, sides, 6): one side where a single threshold bounds the set of a
-    degree of freedom, two where the lower and the upper bound have one each.
+    Scores have the shape (n, sides, 6), with one side if a single threshold bounds the set of a
+    degree of freedom, and two if the lower and upper bound have separate thresholds.
 
     Parameters
     ----------
@@ -47,17 +47,17 @@ class Head(ABC):
     Attributes
     ----------
     outputs
-        Name and shape of every model output that the method reads, all float32.
+        Name and shape of every model output that the method reads; all are float32.
     """
 
     method: ClassVar[str]
     parameters_type: ClassVar[type[Struct]]
     score_names: ClassVar[tuple[str, ...]]
-    # Whether the joint scope has one score for all six degrees of freedom, not six to compare.
+    # Whether the joint scope has a single score for all six degrees of freedom.
     one_joint_score: ClassVar[bool] = False
-    # For reports: what a set of the joint scope is made of.
+    # For reports: the kind of set that the joint scope has.
     set_kind: ClassVar[str] = "each degree of freedom"
-    # For reports: why a threshold can be unbounded although there are enough calibration frames.
+    # For reports: why a threshold may be unbounded despite enough calibration frames.
     infinite_score: ClassVar[str] = "too many calibration truths have an infinite score"
 
     outputs: Mapping[str, tuple[int, ...]]
@@ -79,15 +79,15 @@ class Head(ABC):
             )
 
     def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
-        """Model inputs besides the image for frame number ``seq``; by default none."""
+        """Return the model inputs besides the image for frame ``seq``; none by default."""
         return {}
 
     def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
-        """Marginal confidence of each side's threshold; None where a side is never bounded."""
+        """Return the marginal confidence of each side's threshold; None for an unbounded side."""
         return (confidence,)
 
     def joint_scale(self, scores: Array) -> JointScale:
-        """Scores (n, sides, 6) of val -> how columns are compared for the joint scope."""
+        """Val scores (n, sides, 6) -> the scale that makes them comparable in the joint scope."""
         return LinearScale.fitted(scores)
 
     @abstractmethod
@@ -100,7 +100,7 @@ class Head(ABC):
     ) -> Array:
         """Outputs stacked over n frames, point and truth (n, 6) -> scores (n, sides, 6).
 
-        With ``one_joint_score`` the joint scope has scores of its own.
+        With ``one_joint_score``, the scores depend on the scope.
         """
 
     @abstractmethod
@@ -110,29 +110,29 @@ class Head(ABC):
         """Return the set {y : score(y) <= q_hat} of one frame; point (6,)."""
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """Return the scores that a calibration on other data chooses among, its own first."""
+        """Return the scores that recalibration can choose from, the current one first."""
         return (Candidate(self.score, self.parameters),)
 
     def own_sets(self, outputs: Mapping[str, NDArray[Any]], point: Array) -> list[ConformalSet]:
-        """Return the network's own 90 % bounds of n frames, before any threshold.
+        """Return the network's own 90 % bounds of n frames, before any threshold is applied.
 
-        By default nothing: the network gives no bounds of its own.
+        The default is an empty list, for networks that give no bounds.
         """
         return []
 
     def figures(self, sets: Sequence[ConformalSet]) -> dict[str, Any]:
-        """Return figures of n sets that only this method has, for ``evaluate``; by default none."""
+        """Return method-specific figures of n sets for ``evaluate``; none by default."""
         return {}
 
     @classmethod
     def figures_text(cls, figures: Mapping[str, Any]) -> str:  # noqa: ARG003 - a protocol
-        """Return what ``figures`` found, as text for a person; empty where there is nothing."""
+        """Return the result of ``figures`` as readable text; empty by default."""
         return ""
 
     def description(self) -> str:
-        """Return what the parameters say, as text for a person; by default nothing."""
+        """Return a readable description of the parameters; empty by default."""
         return ""
 
     def joint_description(self, joint: Joint) -> str:
-        """Return how the joint scope is made, as text for a person."""
+        """Return a readable description of how the joint scope combines the scores."""
         return joint

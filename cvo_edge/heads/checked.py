@@ -1,4 +1,4 @@
-"""Building the head of a calibration, and the rules between ``calibration.json`` and its method."""
+"""Build the head of a calibration, and check ``calibration.json`` against its method."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from cvo_edge.bundle.format import Calibration, ModelSpec, Threshold
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError
 from cvo_edge.heads import HEADS, Head
 
-# Thresholds are stored with all digits; comparing scores and back again costs the last ones.
+# Making scores comparable and mapping them back loses the last digits of a threshold.
 _ROUNDING = 1e-9
 
 _SIDES = ("q_hat", "q_hat_upper")
 
 
 def checked_head(calibration: Calibration) -> Head:
-    """Return the head of a calibration, after checking what the method says about its numbers.
+    """Return the head of a calibration, after checking the calibration against the method.
 
     Raises
     ------
     BundleMismatchError
-        The model does not have the tensors that the method works with.
+        The model does not have the tensors that the method needs.
     CalibrationFileError
-        There is no such method, its parameters do not fit it, or a threshold of the joint scope is
-        smaller than it can be.
+        The method is unknown, its parameters are invalid, or a joint threshold is smaller than a
+        marginal one.
     """
     if calibration.method not in HEADS:
         raise CalibrationFileError(
@@ -38,8 +38,8 @@ def checked_head(calibration: Calibration) -> Head:
 
 
 def check_tensors(model: ModelSpec, head: Head) -> None:
-    """Raise BundleMismatchError where a model has other inputs or outputs than its method."""
-    # The image alone is of bytes, as was checked.
+    """Raise BundleMismatchError if the model's inputs or outputs do not match the method."""
+    # The image was checked before; all other inputs are float32.
     image = {spec.name: (spec.dtype, spec.shape) for spec in model.inputs if spec.name == "image"}
     extra = {name: ("float32", noise.shape) for name, noise in head.extra_inputs(0).items()}
     outputs = {name: ("float32", shape) for name, shape in head.outputs.items()}
@@ -55,10 +55,10 @@ def check_tensors(model: ModelSpec, head: Head) -> None:
 
 
 def _check_joint(thresholds: tuple[Threshold, ...], head: Head) -> None:
-    """All six together hold with a confidence: so does each of them, with no smaller threshold.
+    """Check that no joint threshold is smaller than a marginal one of at most the same level.
 
-    A side's own threshold at a level is the level's quantile of its scores; the joint one is at
-    least that of the same level, as the largest of all scores is at least each of them.
+    A marginal threshold is a quantile of one side's scores. The joint threshold is the same
+    quantile of the largest score, which is at least each single score.
     """
     marginal = [entry for entry in thresholds if entry.scope == "marginal"]
     for joint in (entry for entry in thresholds if entry.scope == "joint"):
@@ -66,7 +66,7 @@ def _check_joint(thresholds: tuple[Threshold, ...], head: Head) -> None:
             levels = [(head.side_confidences(m.confidence)[number], m) for m in marginal]
             below = [m for level, m in levels if level is not None and level <= _above(joint)]
             if below:
-                # They grow with the confidence, as was checked: the last one is the largest.
+                # Thresholds grow with the confidence, as checked before: the last is the largest.
                 _compare(side, joint, max(below, key=lambda m: m.confidence))
 
 
@@ -78,12 +78,12 @@ def _compare(side: str, joint: Threshold, marginal: Threshold) -> None:
     for dof, (large, small) in enumerate(
         zip(getattr(joint, side), getattr(marginal, side), strict=True)
     ):
-        # None is unbounded, the largest of all.
+        # None means unbounded, which exceeds every number.
         if large is None or (
             small is not None and large >= small - _ROUNDING * max(1.0, abs(small))
         ):
             continue
         raise CalibrationFileError(
-            f"thresholds.{side}: expected in scope joint at {joint.confidence:g} at least that of "
-            f"scope marginal at {marginal.confidence:g}, found {large} and {small} at [{dof}]"
+            f"thresholds.{side}: expected scope joint at {joint.confidence:g} to be at least scope "
+            f"marginal at {marginal.confidence:g}, found {large} and {small} at [{dof}]"
         )

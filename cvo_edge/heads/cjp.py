@@ -1,7 +1,7 @@
-"""Conformalized joint prediction (CJP): one network gives the pose and both bounds together.
+"""Conformalized joint prediction (CJP): one network predicts the pose and both bounds.
 
-The network's bounds carry no guarantee of their own. Conformalized quantile regression
-(``cvo_edge.heads.cqr``, symmetric, ``additive`` or ``normalised`` score) does the rest.
+The network's bounds carry no guarantee. Conformalized quantile regression (``cvo_edge.heads.cqr``,
+symmetric, with the ``additive`` or ``normalised`` score) calibrates them.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from cvo_edge.heads.cqr import CqrHead
 class CjpParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """``method_parameters`` of a CJP bundle.
 
-    ``half_width_floor``: least half-width per DoF (m, rad) in the normalised score. ``latent``: how
-    the latent variable is drawn (``mean``, ``codebook`` or the paper's ``sample``, whose noise is
-    an input of the model, seeded by ``noise_seed`` and the frame number). ``latent_size``: its
-    dimension.
+    ``half_width_floor``: smallest half-width per DoF (m, rad) in the normalised score. ``latent``:
+    how the latent variable is chosen (``mean``, ``codebook`` or the paper's ``sample``, whose noise
+    is an input of the model, seeded by ``noise_seed`` and the frame number). ``latent_size``:
+    dimension of the latent variable.
     """
 
     half_width_floor: SixPositive
@@ -33,7 +33,7 @@ class CjpParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CjpHead(CqrHead):
-    """Score and set of conformalized joint prediction: those of CQR on the network's bounds."""
+    """Score and set of conformalized joint prediction: CQR applied to the network's bounds."""
 
     method = "cjp"
     parameters_type = CjpParameters
@@ -41,7 +41,7 @@ class CjpHead(CqrHead):
     parameters: CjpParameters
 
     def extra_inputs(self, seq: int) -> Mapping[str, NDArray[np.float32]]:
-        """Latent noise (1, latent_size) in ``sample`` mode, nothing otherwise."""
+        """Return the latent noise (1, latent_size) in ``sample`` mode, otherwise nothing."""
         if self.parameters.latent != "sample":
             return {}
         generator = np.random.default_rng((self.parameters.noise_seed, seq))

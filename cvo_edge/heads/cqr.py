@@ -1,20 +1,20 @@
-"""Conformalized quantile regression (CQR): an interval of the network, corrected to be true.
+"""Conformalized quantile regression (CQR): the network's interval with a conformal correction.
 
-The model gives a point m and bounds Q_l, Q_h (here the quantiles of a forest, inside the graph);
-their own coverage is whatever it is. The nonconformity score says by how much the truth y is
-outside, and its inverse moves the bounds by the conformal quantile q. Three scores, named in
-``calibration.score``:
+The model gives a point m and bounds Q_l, Q_h (here the quantiles of a forest, inside the graph)
+whose coverage is not guaranteed. The nonconformity score measures how far the truth y lies outside,
+and its inverse moves the bounds by the conformal quantile q. ``calibration.score`` names one of
+three scores:
 
 - ``additive`` (Romano, Patterson and Candes 2019, eq. 6): Q_l - y below, y - Q_h above, so the
   set is [Q_l - q, Q_h + q]; a negative q narrows.
 - ``normalised`` (CQR-r, Sesia and Candes 2020): (m - y)/(m - Q_l) below, (y - m)/(Q_h - m) above,
-  half-widths floored, so the set is [m - q (m - Q_l), m + q (Q_h - m)]: frames that the model
-  finds hard get the larger correction.
+  with a lower limit on the half-widths, so the set is [m - q (m - Q_l), m + q (Q_h - m)]. Frames
+  with wide bounds get a larger correction.
 - ``residual``: |y - m|, for a model that gives a point and no bounds; the set is [m - q, m + q].
 
-``sides`` says how the two sides become thresholds: ``symmetric``, their maximum, one q; or
-``asymmetric``, a q for each side at half the miscoverage (Romano et al., theorem 2); or only the
-``lower`` or ``upper`` bound, at the whole miscoverage, the other side unbounded.
+``sides`` says how the two sides are calibrated: ``symmetric`` uses one q for the maximum of both;
+``asymmetric`` uses one q per side, each at half the miscoverage (Romano et al., theorem 2);
+``lower`` and ``upper`` calibrate one bound at the whole miscoverage and leave the other unbounded.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _BOUNDED: dict[str, tuple[int, ...]] = {**_POINT, "lower": (1, 6), "upper": (1, 
 class IntervalScore:
     """The score of an interval and its inverse; all arrays in metres and radians.
 
-    ``floor`` (6,) is the least half-width of the normalised score, None for the additive one.
+    ``floor`` (6,) is the smallest half-width of the normalised score; None selects the additive.
     """
 
     floor: Array | None
@@ -60,7 +60,7 @@ class IntervalScore:
     def inverse(
         self, lower: Array, upper: Array, point: Array, q_low: Array, q_high: Array
     ) -> ConformalSet:
-        """One frame's bounds and point (6,), thresholds (6,) -> its set; if empty, its middle."""
+        """Bounds, point and thresholds (6,) of a frame -> its set, or the midpoint if empty."""
         if self.floor is None:
             lower, upper = lower - q_low, upper + q_high
         else:
@@ -80,8 +80,8 @@ class IntervalScore:
 class CqrParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """``method_parameters`` of a CQR bundle.
 
-    ``half_width_floor``: least half-width per DoF (m, rad) in the normalised score. ``sides``:
-    which bounds are calibrated, and how, see above.
+    ``half_width_floor``: smallest half-width per DoF (m, rad) in the normalised score. ``sides``:
+    how the two sides are calibrated (see the module).
     """
 
     half_width_floor: SixPositive
@@ -105,12 +105,12 @@ class CqrHead(Head):
         self.outputs = _BOUNDED if self._bounds else _POINT
 
     def check(self, thresholds: Sequence[Threshold], joint: Joint) -> None:
-        """As ``Head``: one threshold a side, and factors that are not negative."""
+        """As ``Head``: one threshold per side, and factors that are not negative."""
         symmetric = self._sides == "symmetric"
         if any((entry.q_hat_upper is None) != symmetric for entry in thresholds):
             raise CalibrationFileError(
                 f"thresholds.q_hat_upper: expected {'null' if symmetric else 'six values'} with "
-                f"{self._sides} sides, found otherwise"
+                f"{self._sides} sides, found {'six values' if symmetric else 'null'}"
             )
         for number, level in enumerate(self.side_confidences(0.9)):
             side = "q_hat_upper" if number else "q_hat"
@@ -125,7 +125,7 @@ class CqrHead(Head):
                 refuse_negative(entry, self.score)
 
     def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
-        """The marginal confidence of each side's threshold, None where a side has none."""
+        """As ``Head``; ``asymmetric`` gives each side half the miscoverage."""
         return {
             "symmetric": (confidence,),
             "asymmetric": (0.5 + 0.5 * confidence,) * 2,
@@ -147,7 +147,7 @@ class CqrHead(Head):
     def conformal_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
-        """Outputs of one frame, point (6,) -> its set; where it is empty, its middle."""
+        """Outputs and point (6,) of one frame -> its set, or the midpoint if the set is empty."""
         lower, upper = self._interval(outputs, point)
         q_low = infinite_where_null(threshold.q_hat)
         q_high = q_low
@@ -156,7 +156,7 @@ class CqrHead(Head):
         return self._score.inverse(lower.reshape(6), upper.reshape(6), point, q_low, q_high)
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """As ``Head``; a network without bounds has the residual score alone."""
+        """As ``Head``; a network without bounds has only the residual score."""
         names = (self.score,) if not self._bounds else (self.score, "normalised", "additive")
         return tuple(Candidate(name, self.parameters) for name in dict.fromkeys(names))
 
@@ -178,7 +178,7 @@ class CqrHead(Head):
 
 
 def refuse_negative(entry: Threshold, what: str) -> None:
-    """Raise CalibrationFileError for a negative q_hat: of two opposite scores the larger is not."""
+    """Raise CalibrationFileError for a negative q_hat of a score that is never negative."""
     smallest = min(q for q in (*entry.q_hat, 0.0) if q is not None)
     if smallest < 0.0:
         raise CalibrationFileError(
@@ -189,7 +189,7 @@ def refuse_negative(entry: Threshold, what: str) -> None:
 
 @lru_cache(maxsize=64)
 def infinite_where_null(q_hat: SixOrUnbounded) -> Array:
-    """A stored threshold -> numbers (6,), infinite where it is unbounded; not to be written to."""
+    """Stored threshold -> read-only array (6,), infinite where the threshold is unbounded."""
     numbers = np.array([np.inf if q is None else q for q in q_hat])
     numbers.setflags(write=False)
     return numbers

@@ -1,17 +1,18 @@
-"""Conformalized set prediction (CSP): each degree of freedom as classes, its set a union of them.
+"""Conformalized set prediction (CSP): degrees of freedom as classes, sets as unions of classes.
 
-A degree of freedom's workspace is cut into K classes, narrow where the camera was often; the model
-gives a probability p_k for each. The set holds every class whose nonconformity score is at most the
-conformal quantile: adjacent ones merge into bands, and bands may be apart. Scores, named in
-``calibration.score``, with the probabilities sorted downwards and r_k the rank of class k from 1:
+The workspace of a degree of freedom is divided into K classes, which are narrow where training
+poses are dense; the model gives a probability p_k for each class. The set holds every class whose
+nonconformity score is at most the conformal quantile. Adjacent classes merge into bands, and a set
+may have several bands. ``calibration.score`` names one of three scores; r_k is the rank of class k,
+counted from 1 in descending order of probability:
 
 - ``lac`` (Sadinle, Lei and Wasserman 2019; the paper): 1 - p_k.
-- ``aps`` (Romano, Sesia and Candes 2020, without randomisation): the mass of the classes ranked up
-  to r_k.
+- ``aps`` (Romano, Sesia and Candes 2020, without randomisation): the total probability of the
+  classes up to rank r_k.
 - ``raps`` (Angelopoulos, Bates, Malik and Jordan 2021): ``aps`` + penalty * max(0, r_k - free).
 
-The most probable class is always in the set. A truth outside the workspace has an infinite score,
-in calibration as in use, so that coverage counts it and sets end where the workspace does.
+The most probable class is always in the set. A truth outside the workspace has an infinite score in
+calibration and in evaluation, so coverage counts it as a miss, and sets end at the workspace.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from cvo_edge.vocabulary import Scope
 Array = NDArray[np.float64]
 Score = Literal["lac", "aps", "raps"]
 _SIX = np.arange(6)
-# Of the raps score, for a bundle that has no penalty of its own.
+# Defaults of the raps score for a bundle without a penalty.
 _PENALTY, _FREE_RANKS = 0.01, 5
 Edges = Annotated[tuple[Number, ...], Meta(min_length=3, max_length=513)]
 
@@ -44,9 +45,9 @@ Edges = Annotated[tuple[Number, ...], Meta(min_length=3, max_length=513)]
 class CspParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """``method_parameters`` of a CSP bundle.
 
-    ``edges``: per DoF the ascending edges of its classes (m, rad), one more than classes; a DoF
-    with fewer classes than another leaves the last probabilities unused. ``penalty`` and
-    ``free_ranks``: of the ``raps`` score.
+    ``edges``: the ascending class edges (m, rad) of each DoF, one more than its classes; a DoF with
+    fewer classes than another leaves its last probabilities unused. ``penalty`` and ``free_ranks``
+    belong to the ``raps`` score.
     """
 
     edges: tuple[Edges, Edges, Edges, Edges, Edges, Edges]
@@ -82,7 +83,7 @@ class CspHead(Head):
         self._unused = np.arange(most) >= self._classes[:, None]
 
     def joint_scale(self, scores: Array) -> JointScale:
-        """Scores (n, 1, 6) of other frames -> how DoFs are compared for the joint scope."""
+        """Val scores (n, 1, 6) -> the scale that makes DoFs comparable in the joint scope."""
         top = 1.0
         if self._score == "raps":
             ranks = int(self._classes.max()) - self.parameters.free_ranks
@@ -110,7 +111,7 @@ class CspHead(Head):
     def conformal_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
-        """Outputs of one frame -> its bands and their hull; point (6,) is not needed."""
+        """Outputs of one frame -> its bands and their hull; ``point`` is not used."""
         probabilities = outputs["probabilities"]
         q_hat = infinite_where_null(threshold.q_hat)
         inside = self._class_scores(probabilities)[0] <= q_hat[:, np.newaxis]
@@ -119,7 +120,7 @@ class CspHead(Head):
             inside &= ~self._unused
             likeliest = np.where(self._unused, -1.0, likeliest)
         inside[_SIX, likeliest.argmax(axis=1)] = True
-        # Where membership changes, row by row: starts and ends take turns.
+        # Positions where membership changes, row by row: starts and ends alternate.
         framed = np.zeros((6, inside.shape[1] + 2), dtype=np.bool_)
         framed[:, 1:-1] = inside
         dof, where = np.nonzero(framed[:, 1:] != framed[:, :-1])
@@ -137,7 +138,7 @@ class CspHead(Head):
         )
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """As ``Head``; the raps score needs a penalty, where the bundle has none of its own."""
+        """As ``Head``; the raps score gets a default penalty if the bundle has none."""
         plain = penalised = self.parameters
         if plain.penalty == 0.0:
             penalised = replace(plain, penalty=_PENALTY, free_ranks=_FREE_RANKS)
@@ -146,21 +147,21 @@ class CspHead(Head):
         return tuple(Candidate(name, of) for name, of in (own | family | own).items())
 
     def figures(self, sets: Sequence[ConformalSet]) -> dict[str, Any]:
-        """As ``Head``: ``set_size``, the mean number of classes in a set of each DoF, (6,)."""
+        """As ``Head``: ``set_size`` (6,), the mean number of classes per set of each DoF."""
         return {"set_size": np.mean([self.classes_in(each) for each in sets], axis=0).tolist()}
 
     @classmethod
     def figures_text(cls, figures: Mapping[str, Any]) -> str:
         """As ``Head``."""
-        return f"classes in a set {np.mean(figures['set_size']):.1f}"
+        return f"classes per set {np.mean(figures['set_size']):.1f}"
 
     def description(self) -> str:
-        """As ``Head``: how many classes a degree of freedom has."""
+        """As ``Head``: the number of classes per degree of freedom."""
         counts = [len(row) - 1 for row in self.parameters.edges]
         return f"{min(counts)} to {max(counts)} classes per degree of freedom"
 
     def classes_in(self, conformal_set: ConformalSet) -> NDArray[np.int64]:
-        """Return how many classes of each DoF a set of this head holds, (6,); all if unbounded."""
+        """Return the number of classes per DoF in a set of this head, (6,); all if unbounded."""
         counts = []
         for edges, row in zip(self.parameters.edges, conformal_set.bands or (), strict=True):
             ends = np.searchsorted(edges, np.clip(np.array(row), edges[0], edges[-1]))
@@ -175,15 +176,15 @@ class CspHead(Head):
 def class_scores(
     probabilities: NDArray[Any], score: Score, penalty: float = 0.0, free_ranks: int = 0
 ) -> Array:
-    """Probabilities (n, 6, K) -> the score that each class would have as the truth, (n, 6, K).
+    """Probabilities (n, 6, K) -> the score of each class if it were the truth, (n, 6, K).
 
-    Calibration and sets both read it, so that a class is in the set exactly where its score is at
-    most the threshold.
+    Calibration and prediction share this function, so a class is in the set exactly if its score is
+    at most the threshold.
     """
     p = probabilities.astype(np.float64)
     if score == "lac":
         return np.asarray(1.0 - p)
-    # As one long array, where numpy's indexing is several times faster than along an axis.
+    # numpy indexes one flat array several times faster than along an axis.
     rows = np.arange(0, p.size, p.shape[-1]).reshape(*p.shape[:-1], 1)
     order = np.argsort(-p, axis=-1, kind="stable") + rows
     ranked = np.cumsum(p.ravel()[order], axis=-1)

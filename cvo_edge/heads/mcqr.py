@@ -1,20 +1,20 @@
 """Multivariate conformalized quantile regression (MCQR): one region for all six degrees of freedom.
 
-The model gives a codebook y_1 .. y_J, points that fill a region where residuals are likely
-(directional quantiles in the latent space of a conditional variational autoencoder, Feldman, Bates
-and Romano 2021, decoded along fixed rays), and a lower triangular scale matrix B, which says how
-errors of this frame spread and lean. The nonconformity score of a truth y is its scaled distance
+The model gives a codebook y_1 .. y_J of points that fill a region of likely residuals (directional
+quantiles in the latent space of a conditional variational autoencoder, Feldman, Bates and Romano
+2021, decoded along fixed rays), and a lower triangular scale matrix B, which describes the spread
+and correlation of this frame's errors. The nonconformity score of a truth y is its scaled distance
 
     s = min_j |B^-1 (y - y_j)|
 
-and the region {y : s(y) <= r} is a union of J ellipsoids, of any shape that the codebook has. Its
-hull [min_j y_jd - r |B_d|, max_j y_jd + r |B_d|], with |B_d| the norm of row d, holds all six
-degrees of freedom at once wherever the region holds the truth.
+and the region {y : s(y) <= r} is a union of J ellipsoids, so it follows the shape of the codebook.
+Its hull [min_j y_jd - r |B_d|, max_j y_jd + r |B_d|], with |B_d| the norm of row d, holds all six
+degrees of freedom at once if the region holds the truth.
 
-That is the joint scope. Hulls that hold jointly are too wide for a single degree of freedom, so the
-marginal scope has six thresholds of conformalized quantile regression (``cvo_edge.heads.cqr``) on
-the raw hull, that of r = 1; ``calibration.score`` says whether they are added to it (``additive``)
-or are factors of its half-widths about its middle (``normalised``).
+The joint scope uses this region. Its hull is too wide for a single degree of freedom, so the
+marginal scope applies six thresholds of conformalized quantile regression (``cvo_edge.heads.cqr``)
+to the raw hull (r = 1): ``calibration.score`` says whether they are added to its bounds
+(``additive``) or multiply its half-widths about its midpoint (``normalised``).
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from cvo_edge.vocabulary import Joint, Scope
 Array = NDArray[np.float64]
 
 _HAIR = 1e-12
-# What of the scale matrix counts; outputs are finite here.
+# Only the lower triangle of the scale matrix is used; outputs are finite here.
 _LOWER = np.tril(np.ones((6, 6)))
-# Frames whose distances are computed at a time: each has J differences.
+# Frames per block of distances: each frame needs J differences in memory.
 _BLOCK = 500
 
 
 class McqrParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """``method_parameters`` of an MCQR bundle.
 
-    ``points``: J, size of the codebook. ``half_width_floor``: least half-width per DoF (m, rad) of
-    the raw hull in the normalised score.
+    ``points``: J, size of the codebook. ``half_width_floor``: smallest half-width per DoF (m, rad)
+    of the raw hull in the normalised score.
     """
 
     points: Annotated[int, Meta(ge=1, le=4096)]
@@ -75,12 +75,12 @@ class McqrHead(Head):
         }
 
     def check(self, thresholds: Sequence[Threshold], joint: Joint) -> None:
-        """As ``Head``: one distance for all six in the joint scope."""
+        """As ``Head``: a single distance for all six DoF in the joint scope."""
         super().check(thresholds, joint)
         if joint != "max":
             raise CalibrationFileError(
-                "calibration.joint: expected max for mcqr, which has one score for all six, found "
-                f"{joint}"
+                "calibration.joint: expected max for mcqr, which has one score for all six DoF, "
+                f"found {joint}"
             )
         for entry in thresholds:
             radius = entry.q_hat[0]
@@ -90,12 +90,12 @@ class McqrHead(Head):
                 entry.q_hat == (radius,) * 6 and (radius is None or radius >= 0.0)
             ):
                 raise CalibrationFileError(
-                    "thresholds.q_hat: expected one distance of at least 0, six times, for mcqr "
+                    "thresholds.q_hat: expected the same distance of at least 0 six times for mcqr "
                     f"and scope joint, found {list(entry.q_hat)} at {entry.confidence}"
                 )
 
     def joint_scale(self, scores: Array) -> JointScale:
-        """Nothing to compare: six times one distance."""
+        """As ``Head``: no scaling, because all six scores are the same distance."""
         return LinearScale(np.ones(scores.shape[1:]))
 
     def scores(
@@ -105,9 +105,10 @@ class McqrHead(Head):
         truth: Array,
         scope: Scope = "marginal",
     ) -> Array:
-        """Outputs stacked over n frames, truth (n, 6) -> scores (n, 1, 6); point is not needed.
+        """Outputs stacked over n frames, truth (n, 6) -> scores (n, 1, 6); ``point`` is not used.
 
-        Marginal: of each DoF against the raw hull. Joint: the scaled distance, six times.
+        Marginal: the score of each DoF against the raw hull. Joint: the scaled distance, repeated
+        six times.
         """
         codebook, scale = outputs["codebook"], outputs["scale"] * _LOWER
         if scope == "joint":
@@ -125,20 +126,20 @@ class McqrHead(Head):
     def conformal_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
-        """Outputs of one frame -> its region and hull, or six intervals; point is not needed."""
+        """Outputs of one frame -> its region and hull, or six intervals; ``point`` is not used."""
         q_hat = infinite_where_null(threshold.q_hat)
         radius = float(q_hat[0])
         if threshold.scope == "joint" and radius == np.inf:
             return unbounded_set()
         codebook = outputs["codebook"][0]
         scale = outputs["scale"][0] * _LOWER
-        # Along rows of a copy: four times as fast as along the columns.
+        # Minima along the rows of a copy are four times as fast as along the columns.
         columns = np.ascontiguousarray(codebook.T)
         lowest = columns.min(axis=1).astype(np.float64)
         highest = columns.max(axis=1).astype(np.float64)
         extent = np.sqrt((scale * scale).sum(axis=1))
         if threshold.scope == "joint":
-            # A hair more, so that no rounding leaves a point of the region outside of its hull.
+            # Slightly enlarged, so that rounding leaves no point of the region outside its hull.
             furthest = np.maximum(np.abs(lowest), np.abs(highest))
             reach = radius * extent * (1.0 + _HAIR) + _HAIR * furthest
             ellipsoids = Ellipsoids(codebook, scale, radius)
@@ -153,4 +154,4 @@ class McqrHead(Head):
 
     def joint_description(self, joint: Joint) -> str:
         """As ``Head``."""
-        return "distance to the points of a region"
+        return "distance to the nearest codebook point"

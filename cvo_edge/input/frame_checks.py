@@ -1,9 +1,9 @@
-"""What a frame and its stream must be like for an interval to be claimed.
+"""Checks that a frame and its stream must pass before an interval is given.
 
-A frame check looks at one image, and counts at calibration, too: frames that it flags are neither
-calibrated nor evaluated with, so that what is claimed is claimed of the others. A stream check
-compares a frame with those before it, and only a running stream has it. Both look at what the model
-sees, already halved and resized, so that they cost microseconds.
+A frame check looks at one image. It also applies in calibration and evaluation, which exclude the
+frames it flags, so that the guarantee covers exactly the frames that pass. A stream check compares
+a frame with earlier ones and applies only to running streams. Both use the model's input, already
+halved and resized, so they take microseconds.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from cvo_edge.estimate import Reason
 
 Image8 = NDArray[np.uint8]
 
-# Every eighth pixel of every eighth row: 768 of 256x192.
+# Every eighth pixel of every eighth row: 768 pixels at 256x192.
 _STEP = 8
-# Grey levels of 255. A lens cap with noise hardly has a value above the first, a blown-out image
-# more than half of them from the second on, and what has no contrast varies by no more than the
-# third (standard deviation; a picture's is ten times as large).
+# Grey levels out of 255. Noise behind a lens cap rarely exceeds the first. In an overexposed image
+# more than half of all values reach the second. An image without contrast has a standard deviation
+# below the third; that of a normal image is ten times as large.
 _BLACK, _SATURATED, _FLAT = 20, 250, 4.0
-# A few pixels are hot, or show a time of day.
+# Share of bright pixels tolerated in a black image: hot pixels, or a time overlay.
 _FEW = 0.02
-# Drivers hand out a few buffers in turn, and a dead one may hand out the same few for ever.
+# Drivers cycle through a few buffers; a hung driver may repeat them forever.
 _BUFFERS = 8
 # An older frame says where the camera was, not where it is.
 _STALE_MS = 1000.0
 
 
 class Look:
-    """What is kept of an image until the next one: as the model sees it, and its own size.
+    """Image data kept until the next frame: the model's input and the original size.
 
-    ``tensor`` (1, height, width, 3) uint8 RGB; ``size`` (height, width) of the image itself;
-    ``sample`` some pixels of the tensor, (n, 3), and ``key`` their bytes.
+    ``tensor``: (1, height, width, 3) uint8 RGB; ``size``: (height, width) of the original image;
+    ``sample``: some pixels of the tensor, (n, 3); ``key``: the bytes of ``sample``.
     """
 
     def __init__(self, tensor: Image8, size: tuple[int, int]) -> None:
@@ -47,7 +47,7 @@ class Look:
 
 
 def image_doubt(look: Look) -> Reason | None:
-    """Return what speaks against an image: black, saturated or without contrast; else None."""
+    """Return why an image is rejected (black, saturated or without contrast), or None."""
     sample = look.sample
     if np.count_nonzero(sample > _BLACK) <= _FEW * sample.size:
         return Reason.IMAGE_BLACK
@@ -58,7 +58,7 @@ def image_doubt(look: Look) -> Reason | None:
 
 
 class StreamChecks:
-    """What speaks against a frame where it stands in its stream; frames come in order, once."""
+    """Checks of a frame against its stream; pass every frame once, in order."""
 
     def __init__(self) -> None:
         self._before: Look | None = None
@@ -67,11 +67,11 @@ class StreamChecks:
         self._stamp_ns: int | None = None
 
     def doubts(self, look: Look | None, stamp_ns: int | None, age_ms: float) -> tuple[Reason, ...]:
-        """Compare a frame with those before it, and remember it; no look where it is no image.
+        """Compare a frame with earlier ones and store it; ``look`` is None for an invalid image.
 
-        A sensor's noise never repeats: the same image again is the old one, an encoder's copy of
-        it, or one of a driver's buffers, come round again (compared as the model sees it). Another
-        size than the first frame's is another camera, or another setting of it.
+        Sensor noise never repeats, so an identical model input means a frozen image, a copy made by
+        an encoder, or a reused driver buffer. A size that differs from the first frame's means
+        another camera or another setting.
         """
         doubts: tuple[Reason, ...] = ()
         if look is not None:
@@ -92,6 +92,6 @@ class StreamChecks:
 
     def _seen(self, look: Look) -> bool:
         if self._before is not None and look.key == self._before.key:
-            # Of a picture without noise the rest may have changed.
+            # In an image without noise, pixels outside the sample may have changed.
             return np.array_equal(look.tensor, self._before.tensor)
         return look.key in self._keys

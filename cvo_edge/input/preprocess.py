@@ -1,8 +1,9 @@
-"""Camera image -> the model's input, bit-equal on every machine.
+"""Camera image -> the model's input, bit-identical on every machine.
 
-Only exact integer operations: halving by averaging 2x2 pixels (``INTER_AREA`` at exactly one half)
-and ``INTER_LINEAR_EXACT``; the other OpenCV resizes differ between processors by a grey level,
-which an 8-bit network amplifies. Halving first also keeps the linear step from skipping pixels.
+It uses only exact integer operations: halving by averaging 2x2 pixels (``INTER_AREA`` at exactly
+one half) and ``INTER_LINEAR_EXACT``. Other OpenCV resize modes differ between processors by a grey
+level, which an 8-bit network amplifies. Halving first also keeps the linear step from skipping
+pixels.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ MIN_SIDE = 16
 
 
 def to_bgr8(image: object) -> Image | None:
-    """Any camera image -> (height, width, 3) uint8 BGR, or None where it is no such image.
+    """Any camera image -> (height, width, 3) uint8 BGR, or None if it is not supported.
 
-    Defined conversions: grey (two dimensions or one channel) is repeated, alpha is dropped, 16 bits
-    keep their upper eight.
+    Grey images (two dimensions or one channel) are repeated to three channels, alpha is dropped,
+    and 16-bit values keep their upper eight bits.
     """
     if not isinstance(image, np.ndarray) or image.ndim not in (2, 3):
         return None
@@ -43,10 +44,10 @@ def to_bgr8(image: object) -> Image | None:
 def crop_box(
     image_height: int, image_width: int, height: int, width: int, crop: Crop
 ) -> tuple[int, int, int, int]:
-    """Rows and columns (top, bottom, left, right) that the model sees of an image of this size.
+    """Return the part (top, bottom, left, right) of an image that the model sees.
 
-    ``none``: all of it, squeezed to the target's shape; ``centre``: the largest centred part with
-    the aspect ratio of the target height and width.
+    ``none``: the whole image, stretched to the target's shape; ``centre``: the largest centred part
+    with the aspect ratio of the target height and width.
     """
     if crop == "none":
         return 0, image_height, 0, image_width
@@ -57,7 +58,7 @@ def crop_box(
 
 
 def halved(image: Image, height: int, width: int) -> Image:
-    """Halve, by the rounded mean of 2x2 pixels, while that is exact and leaves the target."""
+    """Halve by rounded 2x2 means while sides are even and at least twice the target."""
     while (
         image.shape[0] % 2 == 0
         and image.shape[1] % 2 == 0
@@ -72,28 +73,28 @@ def halved(image: Image, height: int, width: int) -> Image:
 def model_input(image_bgr: Image, height: int, width: int, crop: Crop) -> Image:
     """Image (any height, any width, 3) BGR -> (1, height, width, 3) RGB, contiguous.
 
-    Halved as long as that is exact, then ``INTER_LINEAR_EXACT`` to the target.
+    The image is halved as often as possible, then resized by ``INTER_LINEAR_EXACT``.
     """
     top, bottom, left, right = crop_box(image_bgr.shape[0], image_bgr.shape[1], height, width, crop)
     image = halved(image_bgr[top:bottom, left:right], height, width)
     if image.shape[:2] == (height, width):
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)[np.newaxis]
-    # OpenCV has vector code for four channels, not for three: the same numbers in less time, the
-    # way there and back included.
+    # OpenCV has vector code for four channels but not for three; the results are identical, and
+    # it is faster even with both conversions.
     four = cv2.cvtColor(image, cv2.COLOR_BGR2RGBA)
     four = cv2.resize(four, (width, height), interpolation=cv2.INTER_LINEAR_EXACT)
     return np.asarray(cv2.cvtColor(four, cv2.COLOR_RGBA2RGB), dtype=np.uint8)[np.newaxis]
 
 
 def selftest_image(height: int, width: int) -> Image:
-    """Build the image of recipe ``ripples-1``: (height, width, 3) uint8 BGR, integers alone.
+    """Build the image of recipe ``ripples-1``, (height, width, 3) uint8 BGR, from integers only.
 
-    Channel c of pixel (x, y) is ((x + 40 c)^2 + 2 y^2 + x y) // 64 mod 512, folded at 256: smooth
-    rings that grow finer to the lower right, so that the resize is tested with the network.
+    Channel c of pixel (x, y) is ((x + 40 c)^2 + 2 y^2 + x y) // 64 mod 512, folded at 256. The
+    smooth rings become finer towards the lower right, so that the resize is tested, too.
     """
     image = np.empty((height, width, 3), np.uint8)
     x = np.arange(width, dtype=np.int64)
-    # Row by row: all of it in 64 bits would take more memory than a model.
+    # Row by row, because the whole image in 64 bits would take more memory than a model.
     for y in range(height):
         for c in range(3):
             wave = ((x + 40 * c) ** 2 + 2 * y**2 + x * y) // 64 % 512

@@ -1,1 +1,1 @@
-"""Where estimates go: sinks, and reading recorded files back."""
+"""Output of estimates: sinks, and reading recorded files back."""

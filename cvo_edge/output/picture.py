@@ -1,4 +1,4 @@
-"""One picture of a run with ground truth, drawn with OpenCV alone."""
+"""A picture of a run with ground truth, drawn with OpenCV only."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Colour = tuple[int, int, int]
 
 WIDTH, HEIGHT = 1200, 800
 
-# Palette of Okabe and Ito (2008), which colour-blind readers can tell apart; BGR.
+# Palette of Okabe and Ito (2008), safe for colour-blind readers; BGR.
 _TRUTH: Colour = (0, 0, 0)
 _ESTIMATE: Colour = (178, 114, 0)
 _INTERVAL: Colour = (248, 222, 188)  # their sky blue, lighter: lines are drawn on top of it
@@ -32,7 +32,7 @@ _GRID: Colour = (232, 232, 232)
 _FRAME: Colour = (150, 150, 150)
 _TEXT: Colour = (60, 60, 60)
 
-# Everything is drawn twice as large and then halved, to a sixteenth of a pixel.
+# Everything is drawn at twice the size, to a sixteenth of a pixel, and then halved.
 _SCALE, _BITS = 2, 4
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _SAMPLE = "truth inside in 50 of 50 frames"
@@ -43,7 +43,7 @@ _PADDING = 0.08
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """A frame that has a pose, finite bounds and a true pose; ``number`` is its place in the run.
+    """A frame with a pose, finite bounds and a true pose; ``number`` is its position in the run.
 
     ``truth`` and ``point`` (6,) in the estimate's chart, metres and radians.
     """
@@ -71,21 +71,21 @@ def draw_run(
     title: str,
     lines: Sequence[str] = (),
 ) -> NDArray[np.uint8]:
-    """Draw a run beside its ground truth.
+    """Draw a run and its ground truth.
 
-    Left: the path in the x-y plane of the world, which is the view from above where z points up,
-    with the boxes of the tx and ty intervals. Right: every DoF over the frames *minus the truth*,
-    cm and deg, so that the zero line is the truth whatever the method's chart. Frames without a
-    pose, finite bounds or a true pose are grey columns.
+    Left: the path in the x-y plane of the world (the view from above if z points up), with the
+    boxes of the tx and ty intervals. Right: each DoF *minus the truth* over the frames, in cm and
+    deg, so that the zero line is the truth in every chart. Frames without a pose, finite bounds or
+    a true pose are grey columns.
 
     Parameters
     ----------
     estimates
         Estimates in the order of the stream.
     truths
-        True ``T_world_camera`` (7,) of each estimate, or None where it is not known.
+        True ``T_world_camera`` (7,) of each estimate, or None if it is unknown.
     title, lines
-        A heading and up to two lines below it; printable ASCII, as OpenCV 4 draws nothing else.
+        A heading and up to two lines below it; printable ASCII only, as OpenCV 4 requires.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def draw_run(
     Raises
     ------
     UsageError
-        No frame has all that is needed, or the lists differ in length.
+        No frame has finite bounds and a true pose, or the lists differ in length.
     """
     if len(estimates) != len(truths):
         raise UsageError(
@@ -105,8 +105,7 @@ def draw_run(
     frames = _compared(estimates, truths)
     if not frames:
         raise UsageError(
-            "picture: expected a frame with finite bounds and a true pose, found none in "
-            f"{len(estimates)}"
+            f"picture: none of the {len(estimates)} frames has finite bounds and a true pose"
         )
     canvas = np.full((_SCALE * HEIGHT, _SCALE * WIDTH, 3), 255, np.uint8)
     _text(canvas, title, (24, 34), 10.5, bold=True, colour=_TRUTH)
@@ -124,16 +123,16 @@ def draw_run(
         _text(canvas, "frame", (left + 142, 748), 6, align=0.5)
     _legend(canvas, greyed=len(frames) < len(estimates))
     picture = cv2.resize(canvas, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
-    # 32 levels a channel look the same and compress to two thirds.
+    # 32 levels per channel look the same and reduce the file by a third.
     return np.asarray(picture // 8 * 8 + picture // 32, np.uint8)
 
 
 def write_png(path: str | Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture as PNG; raises SinkError where the file cannot be written."""
+    """Write a picture as PNG; raises SinkError if the file cannot be written."""
     encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
     try:
         Path(path).write_bytes(encoded.tobytes())
-    # A ValueError is a name that no file can have.
+    # A ValueError means that the name is not a valid file name.
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", error)
         raise SinkError(f"{path}: cannot be written: {reason}") from None
@@ -156,7 +155,7 @@ def _compared(
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """A rectangle of the picture (left, top, right, bottom, pixels) with a scale on either axis."""
+    """A rectangle of the picture (left, top, right, bottom, pixels) with a scale on each axis."""
 
     canvas: NDArray[np.uint8]
     area: tuple[int, int, int, int]
@@ -198,7 +197,7 @@ class _Panel:
 
 
 def _path_from_above(canvas: NDArray[np.uint8], frames: Sequence[_Compared]) -> None:
-    """Draw truth, estimates and boxes of tx and ty; both axes have one scale."""
+    """Draw truth, estimates and boxes of tx and ty; both axes have the same scale."""
     boxes = [np.unique(frame.estimate.position_boxes()[:, :2], axis=0) for frame in frames]
     truth = np.array([frame.truth[:2] for frame in frames])
     points = np.array([frame.point[:2] for frame in frames])
@@ -208,7 +207,7 @@ def _path_from_above(canvas: NDArray[np.uint8], frames: Sequence[_Compared]) -> 
     area = (75, 128, 505, 715)
     low, high = shown.min(axis=0), shown.max(axis=0)
     size = np.array([area[2] - area[0], area[3] - area[1]])
-    # A camera that stands still, and is known exactly, is a point.
+    # The extent is zero if the camera stands still and has exact bounds.
     metres_per_pixel = (1 + 2 * _PADDING) * float(np.max((high - low) / size)) or 1e-6
     half = 0.5 * metres_per_pixel * size
     start, end = 0.5 * (low + high) - half, 0.5 * (low + high) + half
@@ -270,7 +269,7 @@ def _error_over_frames(
         colour = _INTERVAL if frame.covered[dof] else _MISSED_INTERVAL
         for band in row:
             corners = panel.box((frame.number - 0.5, frame.number + 0.5), band)
-            # Without anti-aliasing: neighbours would show a seam.
+            # No anti-aliasing: it would leave seams between neighbours.
             cv2.fillPoly(canvas, [corners], colour, cv2.LINE_8, _BITS)
     panel.grid(
         _ticks(panel.x, _tick_step(count, 6)),
@@ -309,7 +308,7 @@ def _legend(canvas: NDArray[np.uint8], *, greyed: bool) -> None:
 
 
 def _tick_step(extent: float, most: int) -> float:
-    """Return the smallest of 1, 2, 5 times a power of ten that gives at most so many steps."""
+    """Return the smallest 1, 2 or 5 times a power of ten that gives at most ``most`` steps."""
     power: float = 10.0 ** math.floor(math.log10(extent / most))
     return next(
         power * factor for factor in (1.0, 2.0, 5.0, 10.0) if extent <= most * power * factor
@@ -364,10 +363,10 @@ def _text(
     bold: bool = False,
     colour: Colour = _TEXT,
 ) -> None:
-    """Write on a baseline; ``align`` is 0 at the left end, 0.5 in the middle, 1 at the right end.
+    """Draw text on a baseline; ``align`` 0 puts ``place`` at its left end, 0.5 middle, 1 right.
 
-    ``size`` is the mean width of a character in pixels: OpenCV 4 and 5 have different fonts, whose
-    widths have to fit the same layout.
+    ``size`` is the mean width of a character in pixels, because the fonts of OpenCV 4 and 5 differ
+    in width and must fit the same layout.
     """
     thickness = 4 if bold else 2
     scale = size * _SCALE / _character_width(thickness)
@@ -378,5 +377,5 @@ def _text(
 
 @cache
 def _character_width(thickness: int) -> float:
-    """Mean width of a character at scale 1, pixels."""
+    """Return the mean width of a character at scale 1, in pixels."""
     return float(cv2.getTextSize(_SAMPLE, _FONT, 1.0, thickness)[0][0]) / len(_SAMPLE)

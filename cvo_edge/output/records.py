@@ -1,4 +1,4 @@
-"""The header that makes a stream of records readable without its bundle, and reading both back."""
+"""The header, which makes records readable without the bundle, and reading both from a file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Stamps = Literal["fps", "arrival"]
 class Header(
     Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="header", tag_field="kind"
 ):
-    """What holds for all records that follow it: bundle, frames, chart, confidence and scope.
+    """Data shared by all records that follow: bundle, frames, chart, confidence and scope.
 
     Attributes
     ----------
@@ -44,8 +44,8 @@ class Header(
     confidence, scope
         Stated probability, for each degree of freedom (``marginal``) or all six (``joint``).
     stamps
-        What ``stamp_ns`` counts from: ``fps``, frames counted at a given rate; ``arrival``, the
-        system clock when a camera's frame arrived; null, the times of the source, if it has any.
+        Origin of ``stamp_ns``: ``fps``, frames counted at a given rate; ``arrival``, the system
+        clock when a camera's frame arrived; null, the stamps of the source, if it has any.
     """
 
     schema_version: Literal[1] = 1
@@ -73,7 +73,7 @@ def header_of(
     scope: Scope,
     stamps: Stamps | None = None,
 ) -> Header:
-    """Header for the records of one bundle at one confidence and scope."""
+    """Return the header for records of one bundle at one confidence and scope."""
     model, pose, reference = calibration.model, calibration.pose, chart.reference_q_xyzw
     return Header(
         software=f"cvo-edge {__version__}",
@@ -95,14 +95,14 @@ def header_of(
 
 
 class Records:
-    """The records of a file of JSON lines, in its order: an iterator, so for one pass.
+    """Single-pass iterator over the records of a JSON Lines file, in the order of the file.
 
     Attributes
     ----------
     header
-        The header of the record returned last; before the first record, that on the first line.
-        None where there is none, as in files of older versions. A file with several runs appended
-        has one header in front of each run's records.
+        The header of the last record returned; before the first record, the header on the first
+        line. None for records without a header, as written by older versions. A file with several
+        runs has a header before the records of each run.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -128,16 +128,16 @@ class Records:
 
 
 def read_records(path: str | os.PathLike[str]) -> Records:
-    """Open a file of JSON lines that ``cvo-edge run`` wrote; also one without a header.
+    """Open a JSON Lines file written by ``cvo-edge run``, with or without a header.
 
-    An incomplete last line, left by a run that was killed or lost its power or disk, is skipped:
-    each line is written at once, its end last, so that every line before it is whole.
+    After a crash, a power loss or a full disk, an incomplete last line is skipped. All earlier
+    lines are complete, because each line is written in one piece.
 
     Raises
     ------
     SourceError
-        The file cannot be read, or a whole line is no record; names the line. Raised at once for
-        the first line, by the iterator for the others.
+        The file cannot be read, or a complete line is not a record; the message names the line.
+        Raised immediately for the first line, and by the iterator for later lines.
     """
     return Records(path)
 
@@ -162,11 +162,9 @@ def _decoded(path: str | os.PathLike[str]) -> Iterator[Header | Record]:
                 try:
                     decoded = _header_or_record(line)
                 except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-                    raise SourceError(
-                        f"{path!s}: expected a record in line {number}, found none: {error}"
-                    ) from None
+                    raise SourceError(f"{path!s}: line {number} is not a record: {error}") from None
                 yield decoded
-    # A ValueError is a name that no file can have.
+    # A ValueError means that the name is not a valid file name.
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", error)
         raise SourceError(f"{path!s}: cannot be read: {reason}") from None
@@ -176,7 +174,7 @@ def _header_or_record(line: bytes) -> Header | Record:
     try:
         return _RECORD.decode(line)
     except msgspec.ValidationError:
-        # Records have no key "kind"; a header that is not valid says itself what is wrong.
+        # Records have no key "kind"; for an invalid header, its own error is more precise.
         if _KIND.decode(line).kind == "header":
             return _HEADER.decode(line)
         raise

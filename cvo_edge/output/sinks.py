@@ -1,4 +1,4 @@
-"""Where estimates go: JSON lines, CSV, a TUM trajectory or a table, one flushed line a frame."""
+"""Sinks for estimates: JSON Lines, CSV, TUM trajectory or table, one line per frame, unbuffered."""
 
 from __future__ import annotations
 
@@ -26,42 +26,42 @@ _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
 
 
 def format_of(path: str, format: Format | None = None) -> Format:
-    """Return the format of an output: the one asked for, else that of its suffix, else ``jsonl``.
+    """Return an output's format: as requested, or from the suffix of the path, or ``jsonl``.
 
-    Raises UsageError where the suffix (``.jsonl``, ``.csv`` or ``.tum``) stands for another format
-    than the one asked for.
+    Raises UsageError if the suffix (``.jsonl``, ``.csv`` or ``.tum``) contradicts the requested
+    format.
     """
     of_suffix = _SUFFIXES.get(Path(path).suffix.lower())
     if format and of_suffix and format != of_suffix:
         raise UsageError(
-            f"format: expected {of_suffix}, which the name {Path(path).name} stands for, found "
-            f"{format}; change one of them, or leave --format out"
+            f"format: expected {of_suffix} for the file name {Path(path).name}, found {format}; "
+            "change the name or the format, or omit --format"
         )
     return format or of_suffix or "jsonl"
 
 
 class Sink:
-    """Writes one line a frame, past every buffer of ours: an acknowledged record survives us.
+    """Writes one line per frame without buffering, so that written records survive a crash.
 
     Parameters
     ----------
     path
-        Output file, emptied when the first line is written, or ``-`` for standard output.
+        Output file, truncated when the first line is written, or ``-`` for standard output.
     format
-        ``jsonl``, ``csv``, ``tum`` or, for reading by eye, ``table``.
+        ``jsonl``, ``csv``, ``tum`` or the human-readable ``table``.
     header
         Written before the first record: as a JSON line, or as lines ``# key: value`` in ``csv`` and
-        ``tum``. None for records of several bundles in one file.
+        ``tum``. None if the file holds records of several bundles.
     region
-        Put the region's points into the records, where there is one; ``jsonl`` only.
+        Include the points of the region, if there is one, in the records; ``jsonl`` only.
 
     Raises
     ------
     SinkError
-        The file cannot be opened or, later, written; every complete line is kept, and an incomplete
-        one is removed from a regular file.
+        The file cannot be opened or, later, written. Complete lines are kept; an incomplete line is
+        removed from a regular file.
     UsageError
-        A format whose lines have no place for a region.
+        The format cannot hold a region.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Sink:
             raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
 
     def _alone(self) -> None:
-        """Two writers of one file would leave neither's records whole; the lock ends with us."""
+        """Lock a regular file against a second writer; the lock ends with the process."""
         if not self._owned or not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
             return
         try:
@@ -95,10 +95,10 @@ class Sink:
         except BlockingIOError:
             os.close(self._descriptor)
             raise SinkError(
-                f"{self._name}: expected a file that no other run writes to, found one that does"
+                f"{self._name}: another run is writing to this file; choose another output"
             ) from None
         except OSError:
-            return  # a file system that has no locks
+            return  # the file system does not support locks
 
     def __enter__(self) -> Sink:
         """Return itself."""
@@ -117,13 +117,13 @@ class Sink:
     def write(self, estimate: PoseInterval) -> None:
         """Write one estimate.
 
-        Raises SinkError where the disk refuses, BrokenPipeError where the reader has left, and
+        Raises SinkError if writing fails, BrokenPipeError if the reader closed the pipe, and
         UsageError for a TUM line without a stamp.
         """
         line = self._line(estimate)
         if not self._started:
             self._started = True
-            # Not before there is something to put in its place.
+            # Keep the old contents until the first new line is ready.
             if self._owned and stat.S_ISREG(os.fstat(self._descriptor).st_mode):
                 os.ftruncate(self._descriptor, 0)
             line = self._heading(self._header, estimate) + line
@@ -137,7 +137,7 @@ class Sink:
             except BrokenPipeError:
                 raise
             except BlockingIOError:
-                # Another process has asked not to wait for this pipe's reader; records have to.
+                # Another process made this pipe non-blocking; wait until it accepts data.
                 reader = select.poll()
                 reader.register(self._descriptor, select.POLLOUT)
                 reader.poll()
@@ -146,12 +146,12 @@ class Sink:
                 raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
 
     def _take_back(self, written: int) -> None:
-        """Remove the beginning of a line whose rest cannot be written, where that can be done."""
+        """Remove an incomplete line from a regular file."""
         found = os.fstat(self._descriptor)
         if not written or not stat.S_ISREG(found.st_mode):
             return
         end = os.lseek(self._descriptor, 0, os.SEEK_CUR)
-        # Nobody else has written behind it.
+        # Truncate only if nothing follows the incomplete line.
         if end == found.st_size:
             os.ftruncate(self._descriptor, end - written)
             os.lseek(self._descriptor, end - written, os.SEEK_SET)
@@ -170,7 +170,7 @@ def _json_line_with_region(estimate: PoseInterval) -> bytes:
 
 
 def _comments(header: Header | None, _: PoseInterval) -> bytes:
-    """Return the header as lines ``# key: value``: text as it is, everything else as JSON."""
+    """Return the header as lines ``# key: value``: text verbatim, other values as JSON."""
     fields = {} if header is None else msgspec.to_builtins(header)
     lines = (
         f"# {key}: {value if isinstance(value, str) else msgspec.json.encode(value).decode()}\n"
@@ -227,8 +227,8 @@ def _tum_line(estimate: PoseInterval) -> bytes:
         return b""  # the format has no way to say "no pose"
     if estimate.stamp_ns is None:
         raise UsageError(
-            f"tum: expected a stamp for every frame, found none for {estimate.source or 'frame'}; "
-            "give --fps"
+            f"tum: expected a stamp for every frame, {estimate.source or f'frame {estimate.seq}'} "
+            "has none; give --fps"
         )
     seconds, rest = divmod(abs(estimate.stamp_ns), 1_000_000_000)
     sign = "-" if estimate.stamp_ns < 0 else ""

@@ -1,4 +1,4 @@
-"""The table for reading by eye: one line a frame, at most 80 columns wide."""
+"""The human-readable table: one line per frame, at most 80 columns wide."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from collections.abc import Iterable
 from cvo_edge.estimate import PoseInterval, RecordedInterval
 
 _COLUMNS, _NAME_COLUMNS = 80, 12
-# Widths of cells, each with a leading blank: three of the position, six of half-widths.
+# Cell widths, including a leading blank: three for the position, six for half-widths.
 _POSITION_CELLS, _HALF_CELLS = (8, 8, 7), (6,) * 6
 _TO_CM_OR_DEG = (100.0,) * 3 + (math.degrees(1.0),) * 3
-# As many as there are: frame-000007.color.jpg is shown as frame-000007.
+# All suffixes are removed: frame-000007.color.jpg becomes frame-000007.
 _IMAGE_SUFFIXES = re.compile(r"(?<=.)(\.[A-Za-z][A-Za-z0-9]{0,5})+$")
 
 
 def table_heading(estimate: PoseInterval) -> bytes:
-    """Return the four lines above the table: what its numbers are, with names and units."""
+    """Return the four heading lines: meaning of the numbers, names and units."""
     dof = estimate.chart.dof
     widths = (*_POSITION_CELLS, *_HALF_CELLS)
     names = _row((*dof[:3], *dof), widths)
@@ -33,7 +33,7 @@ def table_heading(estimate: PoseInterval) -> bytes:
 
 
 def table_line(estimate: PoseInterval) -> bytes:
-    """Return a frame's line; the reasons stand in place of half-widths where there are none."""
+    """Return the line of a frame; without half-widths it shows the reasons instead."""
     record = estimate.to_record()
     line = f"{_short_name(record.source or str(record.seq))} {record.status:<8}"
     used = _NAME_COLUMNS + 1 + 8
@@ -67,7 +67,7 @@ def _half_widths(interval: RecordedInterval) -> list[str]:
 
 
 def _fitted(value: float, decimals: int, room: int) -> str:
-    """A number in at most ``room`` characters: with fewer decimals, else with an exponent."""
+    """Format a number in at most ``room`` characters, with fewer decimals or an exponent."""
     for places in range(decimals, -1, -1):
         text = f"{value:.{places}f}"
         if len(text) <= room:
@@ -81,7 +81,7 @@ def _fitted(value: float, decimals: int, room: int) -> str:
 
 
 def _listed(reasons: tuple[str, ...], room: int) -> str:
-    """As many reasons as fit into ``room`` characters, and the number of the others."""
+    """List as many reasons as fit into ``room`` characters, and the number of the others."""
     for shown in range(len(reasons), 0, -1):
         others = f" +{len(reasons) - shown}" if shown < len(reasons) else ""
         text = ", ".join(reasons[:shown]) + others
@@ -93,8 +93,8 @@ def _listed(reasons: tuple[str, ...], room: int) -> str:
 
 
 def _short_name(source: str) -> str:
-    """The end of a frame's name without an image's suffixes, padded to its columns."""
-    # A file's name may move a terminal's cursor.
+    """Return the end of a frame's name without image suffixes, padded to its columns."""
+    # A file name may contain terminal control sequences.
     name = "".join(c if c.isprintable() else "?" for c in source)
     kept, used = "", 0
     for character in reversed(_IMAGE_SUFFIXES.sub("", name)):
@@ -106,7 +106,7 @@ def _short_name(source: str) -> str:
 
 
 def _columns(character: str) -> int:
-    """Columns that a terminal gives to a character."""
+    """Return the number of terminal columns of a character."""
     if unicodedata.combining(character):
         return 0
     return 2 if unicodedata.east_asian_width(character) in "WF" else 1

@@ -1,4 +1,4 @@
-"""What a bundle costs on this machine, beside the bare inference call in the same run."""
+"""Benchmark of a bundle on this machine, compared with the bare inference call in the same run."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from cvo_edge.programs.measure import (
 from cvo_edge.scheduling import AHEAD
 from cvo_edge.vocabulary import Scope
 
-# A common camera's frame, used where no source is given, and its rate.
+# Frame size and rate of a common camera, used if no source is given.
 _DEFAULT_HEIGHT, _DEFAULT_WIDTH = 480, 640
 _LIVE_FPS = 30
-# A stream and bare calls take turns so often.
+# How often a stream and bare calls alternate.
 _ROUNDS = 5
-# Of a frame's time; below it other processes do not matter.
+# Share of the time spent waiting for a core that counts as a busy machine.
 _BUSY_SHARE = 0.05
 
 
 @dataclass
 class _Found:
-    """What the frames that count have cost; one ratio a step, or a round of a stream."""
+    """Measurements of the timed frames, with one ratio per step or per round of a stream."""
 
     raw_ms: list[float] = field(default_factory=list)
     ratios: list[float] = field(default_factory=list)
@@ -54,7 +54,7 @@ class _Found:
     skipped: int = 0
     wall_s: float = 0.0
     cpu_s: float = 0.0
-    # From the first to the last of them, bare calls included.
+    # From the first to the last frame, including the bare calls.
     all_s: float = 0.0
     waited_s: float = 0.0
 
@@ -71,19 +71,19 @@ def benchmark(
     scope: Scope = "marginal",
     cache: ModelCache | None = None,
 ) -> dict[str, Any]:
-    """Time ``frames`` frames in a mode, beside bare inference calls on the same model.
+    """Time ``frames`` frames in a mode, and as many bare inference calls on the same model.
 
-    The two take turns, so that a change of the machine's speed meets both: in mode ``latency`` a
-    step and a call, in the others a fifth of the frames as a stream and as many calls.
-    ``ratio_to_raw`` is the median of one over the other, of the step without reading, in
-    ``throughput`` the time a frame, in ``live`` the age of a frame at its interval. Files are read
-    again and again, in ``live`` at 30 frames a second. Without a source a still synthetic image is
-    used; its pose may be implausible, and then the conformal step is not run; ``frames_valid``
-    counts those where it was. Invalid frames of a source are not timed. Returns the report of
-    ``cvo-edge bench --json``.
+    The two alternate, so that changes of the machine's speed affect both: in mode ``latency`` one
+    step and one call, in other modes a fifth of the frames as a stream and as many calls.
+    ``ratio_to_raw`` is the median ratio of a frame's time to that of a call. A frame's time is the
+    step without reading in ``latency``, the time per frame in ``throughput``, and the age of a
+    frame at its interval in ``live``. Files are read repeatedly, in ``live`` at 30 frames per
+    second. Without a source, the benchmark uses a synthetic still image; if its pose is
+    implausible, the conformal step is not run. ``frames_valid`` counts frames with a plausible
+    pose. Invalid frames of a source are not timed. Returns the report of ``cvo-edge bench --json``.
 
-    Raises UsageError for counts below one, SourceError where the source gives no valid frame, and
-    what ``Odometer.load`` raises.
+    Raises UsageError for invalid counts, SourceError if the source gives no valid frame, and the
+    errors of ``Odometer.load``.
     """
     if frames < 1 or warmup < 0:
         raise UsageError(
@@ -104,9 +104,7 @@ def benchmark(
     measure = _steps if odometer.mode == "latency" else _streams
     found = measure(odometer, session, stream, frames, warmup)
     if not found.latency.count:
-        raise SourceError(
-            f"{shown(source or 'image')}: expected at least one valid frame, found none in {frames}"
-        )
+        raise SourceError(f"{shown(source or 'image')}: none of {frames} frames is valid")
     counted = found.latency.count
     return {
         "bundle": odometer.calibration.name,
@@ -134,7 +132,7 @@ def benchmark(
 def _steps(
     odometer: Odometer, session: Session, stream: _Endless, frames: int, warmup: int
 ) -> _Found:
-    """One step, one bare call on the same image, and so on."""
+    """Alternate single steps with bare calls on the same image."""
     found = _Found()
     spec = odometer.calibration.preprocess
     feeds = _blank_feeds(odometer)
@@ -147,7 +145,7 @@ def _steps(
         cpu_begin, begin = process_time(), perf_counter()
         estimate = odometer.step(frame.image, frame.stamp_ns, frame.source, frame.read_ms)
         spent_s, cpu_s = perf_counter() - begin, process_time() - cpu_begin
-        if not count % 2:  # whoever comes second finds warmer caches
+        if not count % 2:  # the second of the two benefits from warmer caches
             raw_ms = _raw_ms(session, feeds)
         if count >= warmup and _counts(estimate, stream):
             found.valid += estimate.pose is not None
@@ -164,7 +162,7 @@ def _steps(
 def _streams(
     odometer: Odometer, session: Session, stream: _Endless, frames: int, warmup: int
 ) -> _Found:
-    """A part of the frames as a stream, as many bare calls, and so on."""
+    """Alternate parts of a stream with as many bare calls."""
     found = _Found()
     feeds = _blank_feeds(odometer)
     live = odometer.mode == "live"
@@ -173,7 +171,7 @@ def _streams(
             pass
         all_begin, waited_s = perf_counter(), waited_for_cores_s()
         for part in np.array_split(np.arange(frames), min(_ROUNDS, frames)):
-            # What came while bare calls were timed, or lies ready since.
+            # Skip estimates that were computed while bare calls were timed.
             lying = islice(estimates, odometer.threads + AHEAD)
             before = [estimate.seq for estimate in lying][-1]
             ages_ms = []
@@ -193,14 +191,14 @@ def _streams(
             if ages_ms:
                 whole_ms = float(np.median(ages_ms)) if live else 1e3 * spent_s / len(ages_ms)
                 found.ratios.append(whole_ms / float(np.median(raw_ms)))
-        # Here, while the workers whose waiting counts are there.
+        # Read before the stream ends, while its worker threads still exist.
         found.all_s = perf_counter() - all_begin
         found.waited_s = waited_for_cores_s() - waited_s
     return found
 
 
 def _counts(estimate: PoseInterval, stream: _Endless) -> bool:
-    """An invalid frame is quick: it must not flatter the figures of a real source."""
+    """Whether to time a frame: invalid frames of a real source are fast and would bias results."""
     return stream.still or estimate.pose is not None
 
 
@@ -211,7 +209,7 @@ def _blank_feeds(odometer: Odometer) -> dict[str, Any]:
 
 
 def benchmark_lines(report: dict[str, Any]) -> list[str]:
-    """Return the report as lines of text for a person."""
+    """Return the report as lines of readable text."""
     header = f"{'ms':<12}" + "".join(f"{name:>9}" for name in ("p50", "p90", "p95", "p99", "mean"))
     rows = {**report["latency_ms"], "bare model": report["raw_model_ms"]}
     where = report["environment"]
@@ -223,8 +221,8 @@ def benchmark_lines(report: dict[str, Any]) -> list[str]:
         *(f"{k:<12}" + "".join(f"{v:>9.3f}" for v in row.values()) for k, row in rows.items()),
         f"{_RATIOS[report['mode']]} over the bare model call: "
         f"{report['ratio_to_raw']['median']:.3f}",
-        f"{report['throughput_fps']:.0f} frames/s, {report['cpu_ms_per_frame']:.2f} CPU-ms a "
-        f"frame, load {report['load_ms']:.0f} ms, first interval "
+        f"{report['throughput_fps']:.0f} frames/s, {report['cpu_ms_per_frame']:.2f} CPU-ms "
+        f"per frame, load {report['load_ms']:.0f} ms, first interval "
         f"{report['first_interval_ms']:.0f} ms after process start",
         *_remarks(report),
         "memory MiB: " + ", ".join(f"{k} {v:.0f}" for k, v in report["memory_mib"].items()),
@@ -233,7 +231,7 @@ def benchmark_lines(report: dict[str, Any]) -> list[str]:
 
 _RATIOS = {
     "latency": "array to interval",
-    "throughput": "time a frame",
+    "throughput": "time per frame",
     "live": "age of a frame at its interval",
 }
 
@@ -247,22 +245,22 @@ def _raw_ms(session: Session, feeds: dict[str, Any]) -> float:
 def _remarks(report: dict[str, Any]) -> list[str]:
     remarks = []
     if report["frames_skipped"]:
-        remarks.append(f"{report['frames_skipped']} frames skipped for newer ones")
+        remarks.append(f"{report['frames_skipped']} frames dropped for newer ones")
     if report["frames_valid"] < report["frames"]:
         remarks.append(
-            f"{report['frames_valid']} of {report['frames']} frames gave a plausible pose; a "
-            "SOURCE of the scene times the conformal step on every frame"
+            f"{report['frames_valid']} of {report['frames']} frames gave a plausible pose; "
+            "give a SOURCE from the bundle's scene to time the conformal step on every frame"
         )
     if report["waited_for_cores"] > _BUSY_SHARE:
         remarks.append(
             f"busy machine: {report['waited_for_cores']:.0%} of the time was spent waiting for a "
-            "core that others had; beside them fewer --threads may be faster"
+            "core used by other processes; fewer --threads may be faster"
         )
     return remarks
 
 
 class _Endless:
-    """A source again and again, as one; without one a still image."""
+    """A source repeated endlessly; without a source, a still image."""
 
     length = None
 
@@ -270,11 +268,11 @@ class _Endless:
         self.still = source is None
         self._source = source
         self.live = source is not None and names_camera(source)
-        # Whoever asks again goes on: many a camera serves one client, once.
+        # One iterator for all callers, because many cameras serve a single client only.
         self._numbered = enumerate(self._again())
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
-        """Yield a call for each frame; those of files have the stamps of a steady camera."""
+        """Yield a call per frame; frames of files get the stamps of a camera at a constant rate."""
         for seq, read in self._numbered:
             yield read if self.live else partial(_stamped, read, round(seq * 1e9 / _LIVE_FPS))
 
@@ -293,7 +291,7 @@ class _Endless:
             reads = open_source(self._source).reads()
             first = next(reads, None)
             if first is None:
-                raise SourceError(f"{shown(self._source)}: expected frames, found none")
+                raise SourceError(f"{shown(self._source)}: the source has no frames")
             yield from chain([first], reads)
 
 
@@ -302,7 +300,7 @@ def _stamped(read: Callable[[], Frame], stamp_ns: int) -> Frame:
 
 
 def _process_age_ms() -> float:
-    """Milliseconds since this process started, by the kernel's clock (0 where unknown)."""
+    """Return the milliseconds since this process started, by the kernel's clock (0 if unknown)."""
     try:
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         uptime = time.clock_gettime(time.CLOCK_BOOTTIME)

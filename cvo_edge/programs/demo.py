@@ -1,4 +1,4 @@
-"""The demonstration: a bundle on the packaged clip, judged by its ground truth, with a picture."""
+"""The demonstration: run a bundle on the packaged clip, compare with ground truth, and draw it."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ _ROWS = 4
 
 
 def demo(bundle: Path, picture: Path) -> None:
-    """Verify a bundle, run it on the packaged clip, print what it finds and draw it as PNG.
+    """Verify a bundle, run it on the packaged clip, print the results and draw them as PNG.
 
-    Prints to standard output; the last line is the path of the picture.
+    Results go to standard output; the last line is the path of the picture.
 
     Raises
     ------
     UsageError
-        The picture's name does not end in ``.png``, or no frame of the clip has an interval: the
-        bundle is not of the clip's scene.
+        The picture's name does not end in ``.png``, or no frame of the clip has an interval (the
+        bundle was trained on another scene).
     SinkError
         The picture cannot be written.
     CvoError
-        The bundle is refused, as by ``verify_bundle``.
+        ``verify_bundle`` refuses the bundle.
     """
     if picture.suffix.lower() != ".png":
         raise UsageError(f"picture: expected a name that ends in .png, found {picture}")
     print(verify_bundle(bundle).line(), flush=True)
     truth = open_ground_truth(CLIP)
     estimates: list[PoseInterval] = []
-    # Without the model cache: the picture is all that a demonstration leaves behind.
+    # The model cache is not used, so that the picture is the only file that the demo creates.
     with (
         Odometer.load(bundle, confidence=_CONFIDENCE, scope=_SCOPE) as odometer,
         Sink("-", "table") as table,
@@ -76,10 +76,10 @@ def demo(bundle: Path, picture: Path) -> None:
 
 
 def expected_coverage(digest: str) -> str | None:
-    """Say which coverage one recording of the scene has, as measured over many.
+    """Return the coverage to expect of one recording of the scene, measured over many.
 
-    ``digest`` of a bundle's calibration; None where that bundle was not measured, as coverage of a
-    single recording follows from no theory. ``bench/expected_coverage.py`` measures.
+    ``digest`` is that of the bundle's calibration. Returns None if the bundle was not measured by
+    ``bench/expected_coverage.py``: theory does not give the coverage of a single recording.
     """
     report: dict[str, Any] = msgspec.json.decode(EXPECTED.read_bytes())
     found = report["bundles"].get(digest)
@@ -97,7 +97,7 @@ def expected_coverage(digest: str) -> str | None:
 
 
 def _found(summary: RunSummary) -> str:
-    """Return the coverage of the clip as a sentence."""
+    """Return a sentence with the coverage on the clip."""
     if not summary.compared:
         return ""
     covered = float(summary.covered.mean()) / summary.compared

@@ -1,4 +1,4 @@
-"""Descriptions of a bundle and of a machine as lines of text, and the JSON Schema."""
+"""Readable descriptions of a bundle, a machine and a cache, and the JSON Schema."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cvo_edge.pose import Chart
 
 
 def inspect_lines(calibration: Calibration) -> list[str]:
-    """Return a bundle's description for a person; raises as ``checked_head``."""
+    """Return a readable description of a bundle; raises as ``checked_head``."""
     model, source = calibration.model, calibration.calibration
     pose, head = calibration.pose, checked_head(calibration)
     details = f", {head.description()}" if head.description() else ""
@@ -40,7 +40,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
             f"{source.split.kind} (seed {source.split.seed}), {source.rule}{_worth(source)}",
         ),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
-        *_entry("backbone", calibration.provenance.backbone or "a given network"),
+        *_entry("backbone", calibration.provenance.backbone or "a network supplied as ONNX"),
         "",
         f"{'q_hat at':<18}" + "".join(f"{name:>10}" for name in dof),
     ]
@@ -55,7 +55,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
 
 
 def _entry(label: str, text: str) -> list[str]:
-    """Lines of at most 80 columns, the label before the first."""
+    """Wrap text to 80 columns, with the label before the first line."""
     return wrap(
         text,
         80,
@@ -66,7 +66,7 @@ def _entry(label: str, text: str) -> list[str]:
 
 
 def _unbounded(calibration: Calibration, head: Head) -> list[str]:
-    """Say why thresholds are unbounded: how many frames or sequences they would need."""
+    """Explain unbounded thresholds: the number of frames or sequences they would need."""
     source = calibration.calibration
     unit, given = ("frames", source.n)
     if source.rule == "hierarchical":
@@ -95,14 +95,14 @@ def _unbounded(calibration: Calibration, head: Head) -> list[str]:
 
 
 def _worth(source: CalibrationSpec) -> str:
-    """Remark that frames of one recording are dependent; a random split deals that away."""
+    """Return the effective sample size, except for a random split, which hides dependence."""
     if source.split.kind == "random":
         return ""
     return f"; worth about {source.n_effective:.0f} independent frames"
 
 
 def doctor_lines(report: dict[str, Any]) -> list[str]:
-    """Return the environment for a person."""
+    """Return a readable description of the environment."""
     versions = ", ".join(f"{name} {value}" for name, value in report["versions"].items())
     return [
         *_entry("processor", f"{report['cpu']} ({report['architecture']})"),
@@ -116,7 +116,7 @@ def doctor_lines(report: dict[str, Any]) -> list[str]:
 
 
 def cache_lines(cache: ModelCache) -> list[str]:
-    """Return what a cache holds for a person."""
+    """Return a readable list of the entries of a cache."""
     entries = cache.entries()
     lines = _entry("folder", f"{cache.folder}, {len(entries)} optimised model(s)")
     obstacle = cache.obstacle()
@@ -124,7 +124,7 @@ def cache_lines(cache: ModelCache) -> list[str]:
         lines += _entry("not used", obstacle)
     for entry in entries:
         made = f"sha256 {entry.model_sha256[:16]}..., onnxruntime {entry.onnxruntime}"
-        other = "" if entry.current else ", of another machine or release"
+        other = "" if entry.current else ", for another machine or release"
         lines += _entry(f"{entry.megabytes:9.1f} MB", f"{entry.name} ({made}{other})")
     return lines
 

@@ -1,4 +1,4 @@
-"""What it costs and where it ran: latency quantiles a stage, memory, environment."""
+"""Measurements: latency quantiles per stage, memory, and the environment."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ STAGES = ("read", "preprocess", "model", "conformal", "total")
 
 
 class LatencyProfile:
-    """Latencies per stage in bounded memory: the first frames exactly, then the latest.
+    """Latencies per stage in bounded memory.
 
-    A ring of ``capacity`` values a stage: quantiles of a week-long run are those of its last
-    frames, and memory stays flat.
+    Each stage has a ring buffer of ``capacity`` values, so the quantiles of a longer run are those
+    of its last ``capacity`` frames.
     """
 
     def __init__(self, stages: Iterable[str] = STAGES, capacity: int = 100_000) -> None:
@@ -32,7 +32,7 @@ class LatencyProfile:
         self.count = 0
 
     def add(self, latency_ms: Mapping[str, float]) -> None:
-        """Record one frame's milliseconds by stage."""
+        """Record the milliseconds of one frame by stage."""
         index = self.count % self._capacity
         for stage, values in self._values.items():
             if index >= values.size:
@@ -43,13 +43,13 @@ class LatencyProfile:
         self.count += 1
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """Stage -> p50, p90, p95, p99 and mean in milliseconds; empty without a frame."""
+        """Return p50, p90, p95, p99 and mean in milliseconds by stage; empty without frames."""
         kept = min(self.count, self._capacity)
         return {stage: quantiles(values[:kept]) for stage, values in self._values.items() if kept}
 
 
 def quantiles(values_ms: ArrayLike) -> dict[str, float]:
-    """p50, p90, p95, p99 and mean of milliseconds, rounded to 0.1 us."""
+    """Return p50, p90, p95, p99 and mean of milliseconds, rounded to 0.1 us."""
     values = np.asarray(values_ms, dtype=np.float64)
     found = {f"p{q}": float(np.percentile(values, q)) for q in (50, 90, 95, 99)}
     found["mean"] = float(values.mean())
@@ -57,7 +57,7 @@ def quantiles(values_ms: ArrayLike) -> dict[str, float]:
 
 
 def memory_mib() -> dict[str, float]:
-    """Peak and present resident memory and its anonymous part, MiB (0 where unknown)."""
+    """Return peak, current and anonymous resident memory in MiB (0 if unknown)."""
     kib = {"VmHWM": 0.0, "VmRSS": 0.0, "RssAnon": 0.0}
     try:
         for line in Path("/proc/self/status").read_text().splitlines():
@@ -65,7 +65,7 @@ def memory_mib() -> dict[str, float]:
             if name in kib:
                 kib[name] = float(value.split()[0])
     except OSError:
-        # No /proc: the peak alone, in KiB on Linux and bytes on macOS.
+        # Without /proc only the peak is known, in KiB on Linux and bytes on macOS.
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         kib["VmHWM"] = peak / 1024 if sys.platform == "darwin" else peak
     return {
@@ -76,21 +76,21 @@ def memory_mib() -> dict[str, float]:
 
 
 def waited_for_cores_s() -> float:
-    """Seconds that threads of this process have been ready to run and had no core (0 if unknown).
+    """Return the seconds that this process's threads were ready but had no core (0 if unknown).
 
-    Of the threads that there are now; what others on the machine take shows here.
+    Only existing threads count. The figure reveals load from other processes.
     """
     waited_ns = 0
     for path in Path("/proc/self/task").glob("*/schedstat"):
-        # A thread may have ended in between.
+        # A thread may have ended meanwhile.
         with contextlib.suppress(OSError, ValueError, IndexError):
             waited_ns += int(path.read_text().split()[1])
     return 1e-9 * waited_ns
 
 
 def environment(threads: int | None = None) -> dict[str, Any]:
-    """Return what a reader needs to judge a latency: processor, cores, versions, governor."""
-    # Not for every start of a program that is not asked for it.
+    """Return what is needed to interpret latencies: processor, cores, versions, governor."""
+    # Imported here to keep the start of other commands fast.
     import importlib.metadata
 
     versions = {"python": platform.python_version()}

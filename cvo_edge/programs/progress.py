@@ -1,4 +1,4 @@
-"""One line on a terminal that tells how far a run is: frames, rate, time left and statuses."""
+"""A progress line on the terminal: frames, rate, time left and statuses."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _CLEAR = "\r\x1b[K"
 
 
 class FramesProgress:
-    """Rewrites its line at most ten times a second; most calls only look at the clock.
+    """Progress line that is rewritten at most ten times per second; other calls return quickly.
 
     Parameters
     ----------
     stream
         The terminal.
     summary
-        Counts of the run, kept up to date by its owner.
+        Counts of the run, updated by the caller.
     total
-        Number of frames to come, None where the source does not tell.
+        Total number of frames, or None if the source does not tell.
     clock
         Monotonic time in seconds.
     """
@@ -46,7 +46,7 @@ class FramesProgress:
         self._shown = False
 
     def tick(self) -> None:
-        """Call this once a frame."""
+        """Update the line if it is due; call this once per frame."""
         now = self._clock()
         if now >= self._next:
             self._next = now + _SECONDS_BETWEEN_UPDATES
@@ -54,7 +54,7 @@ class FramesProgress:
             self._shown = True
 
     def line(self, now: float) -> str:
-        """Return the text for a moment of the clock."""
+        """Return the text at the time ``now``."""
         summary = self._summary
         done = summary.frames + summary.skipped
         rate = summary.frames / max(now - self._begin, 1e-9)
@@ -70,12 +70,12 @@ class FramesProgress:
         return "  ".join(parts)
 
     def close(self) -> None:
-        """Remove the line, so that the next output begins in an empty one."""
+        """Erase the line."""
         if self._shown:
             self._put(_CLEAR)
 
     def _put(self, text: str) -> None:
-        # A terminal that has gone is no reason to end a run.
+        # Losing the terminal must not end the run.
         try:
             self._stream.write(text)
             self._stream.flush()
@@ -87,7 +87,7 @@ class FramesProgress:
 def frames_progress(
     wanted: bool, summary: RunSummary, length: int | None, max_frames: int | None
 ) -> Iterator[Callable[[], None]]:
-    """Yield the function to call once a frame; it does nothing where stderr is no terminal."""
+    """Yield a function to call once per frame; it does nothing if stderr is not a terminal."""
     stream = sys.stderr
     if not wanted or stream is None or not stream.isatty():
         yield _nothing
@@ -101,7 +101,7 @@ def frames_progress(
 
 
 def _nothing() -> None:
-    """Nobody watches."""
+    """Do nothing."""
 
 
 def _columns(stream: TextIO) -> int:

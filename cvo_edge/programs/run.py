@@ -1,4 +1,4 @@
-"""A whole run: every frame of a source through the odometer into a sink, and its summary."""
+"""A complete run: estimate every frame of a source, write the estimates, and summarise."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ Array = NDArray[np.float64]
 
 @dataclass
 class RunSummary:
-    """Counts, latencies and, with ground truth, coverage: running sums, flat in memory.
+    """Counts, latencies and, with ground truth, coverage, in constant memory.
 
-    Widths are the means over bounded frames, without the gaps of a set that has some; ``disjoint``
-    counts frames with a gap in some degree of freedom; ``skipped`` those that were left out for a
-    newer one; ``covered`` and ``compared`` count frames whose true pose is known and that have a
-    pose.
+    ``width_sum`` sums the widths of bounded frames, without gaps; ``disjoint`` counts frames with a
+    gap in some degree of freedom; ``skipped`` counts frames dropped for a newer one; ``compared``
+    counts frames with an estimated and a true pose, and ``covered`` those whose set holds the true
+    value, per degree of freedom.
     """
 
     dof: tuple[str, ...]
@@ -44,11 +44,11 @@ class RunSummary:
     compared: int = 0
     covered: Array = field(default_factory=lambda: np.zeros(6))
     covered_jointly: int = 0
-    # An odometer numbers its frames from 0: also the first ones may have been left out.
+    # Frames are numbered from 0, so that dropped frames at the start are counted, too.
     _last_seq: int = -1
 
     def add(self, estimate: PoseInterval, truth: Array | None) -> None:
-        """Count one estimate; ``truth`` is its true pose (7,) where it is known."""
+        """Count one estimate; ``truth`` is its true pose (7,) or None."""
         self.skipped += estimate.seq - self._last_seq - 1
         self._last_seq = estimate.seq
         self.statuses[estimate.status] += 1
@@ -69,11 +69,11 @@ class RunSummary:
         return self.statuses.total()
 
     def lines(self) -> list[str]:
-        """Return the summary as lines of text for a person."""
+        """Return the summary as lines of readable text."""
         counts = ", ".join(f"{self.statuses[status]} {status}" for status in Status)
         lines = [f"frames      {self.frames}: {counts}; {self.bounded} with finite bounds"]
         if self.skipped:
-            lines.append(f"skipped     {self.skipped} frames, for newer ones")
+            lines.append(f"dropped     {self.skipped} frames, for newer ones")
         if self.disjoint:
             lines.append(f"bands       {self.disjoint} frames with a set in more than one piece")
         if self.reasons:
@@ -88,7 +88,7 @@ class RunSummary:
             )
         lines.append(f"memory MiB  peak {memory_mib()['peak_rss']:.0f}")
         width = self.width_sum / max(1, self.bounded)
-        # Metres and radians become the centimetres and degrees that people think in.
+        # Shown in centimetres and degrees.
         shown = np.concatenate([width[:3] * 100, np.rad2deg(width[3:])])
         units = ["cm"] * 3 + ["deg"] * 3
         lines.append(f"at {self.confidence:g} {self.scope}" + "".join(f"{n:>9}" for n in self.dof))
@@ -117,10 +117,10 @@ def run(
     max_frames: int | None = None,
     tick: Callable[[], None] | None = None,
 ) -> None:
-    """Step through ``frames``, write each estimate and count it in ``summary``.
+    """Estimate all ``frames``; write each estimate and count it in ``summary``.
 
-    The caller owns the summary, so that it can still be shown when a source ends early. ``tick`` is
-    called after each frame.
+    The caller owns the summary and can show it even if the source ends early. ``tick`` is called
+    after each frame.
     """
     with closing(odometer.stream(frames)) as estimates:
         for estimate in islice(estimates, max_frames):

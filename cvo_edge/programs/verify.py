@@ -1,9 +1,8 @@
-"""The self-test of a bundle that nobody trusts yet, in a process of its own with limits.
+"""The self-test of an untrusted bundle, in a child process with limits.
 
-A model is a program: of a few hundred bytes it can loop for ever or ask for all memory, and an
-engine that is given a damaged one may crash. So whoever asks is not the one who loads it: the child
-process has a limit of memory and time, and ends with whatever its model did; its answer is one line
-of JSON.
+A model is a program: a few hundred bytes suffice to loop forever or to request all memory, and a
+damaged model may crash the engine. Therefore a child process with limited memory and time loads the
+model, and answers with one line of JSON.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ from cvo_edge.errors import (
 )
 
 TIMEOUT_S, SHORTEST_S, LONGEST_S = 60.0, 0.1, 86400.0
-# What a process needs before there is a model, and what onnxruntime makes of a byte of one.
+# Memory of a process without a model, and memory that onnxruntime needs per byte of a model.
 _BASE_BYTES, _PER_MODEL_BYTE = 1 << 30, 8
-# A thread's, where the system has no limit for it.
+# Stack size of a thread if the system sets no limit.
 _STACK_BYTES = 8 << 20
-# A pipe takes 64 KiB without a reader.
+# A pipe buffers 64 KiB without a reader.
 _LONGEST_ANSWER, _LONGEST_DEFECT = 1 << 16, 8000
 
 _CHILD = "from cvo_edge.programs.verify import child; child()"
@@ -44,14 +43,14 @@ _ERRORS: dict[int, type[CvoError]] = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """A bundle that passed: its name, the largest difference in its self-test, the tolerance."""
+    """Result of a bundle that passed: name, largest self-test difference, tolerance."""
 
     name: str
     largest_difference: float
     tolerance: float
 
     def line(self) -> str:
-        """Return the verdict as a line of text for a person."""
+        """Return the verdict as one line of readable text."""
         return (
             f"{self.name}: digests match, model loads, self-test passed (largest difference "
             f"{self.largest_difference:.2g}, tolerance {self.tolerance:g})"
@@ -67,18 +66,19 @@ def verify_bundle(
 ) -> Verdict:
     """Check the digests of a bundle, load it and run its self-test, in a child process.
 
-    Of the model as it is, and as the cache of prepared models has it, where it has. With a public
-    key the signature as well, and that the version is none that this device has gone beyond.
+    The self-test runs on the model itself and, if the cache holds one, on its prepared model. With
+    a public key, the signature and the version are checked, too: the version must not be older than
+    one that this device has run.
 
     Raises
     ------
     CalibrationFileError, BundleMismatchError
         As ``read_bundle`` and ``Odometer``.
     ModelError
-        As well where loading and self-test took longer than ``timeout_s`` seconds, more memory than
-        1 GiB, eight times the model's size and its threads' stacks, or the process itself.
+        Also if loading and self-test take longer than ``timeout_s`` seconds, need more memory than
+        1 GiB plus eight times the model's size plus its threads' stacks, or end the process.
     GateError
-        The model computes something else than what was calibrated.
+        The model's outputs differ from those of the calibrated model.
     UsageError
         ``threads`` or ``timeout_s`` is out of range.
     """
@@ -87,7 +87,7 @@ def verify_bundle(
             f"timeout: expected {SHORTEST_S:g} to {LONGEST_S:g} s, found {timeout_s:g}"
         )
     receiver, sender = os.pipe()
-    # All there is once the process has ended, whoever else may hold the other end.
+    # Non-blocking, because another process may still hold the other end of the pipe.
     os.set_blocking(receiver, False)
     with contextlib.ExitStack() as stack:
         answers = stack.enter_context(os.fdopen(receiver, "rb"))
@@ -99,17 +99,17 @@ def verify_bundle(
         }
         try:
             process = subprocess.Popen(  # noqa: S603 - this very interpreter, no shell
-                # -P: a folder that happens to be the current one is not where modules come from.
+                # -P: do not import modules from the current folder.
                 [sys.executable, "-P", "-c", _CHILD, str(sender), json.dumps(order)],
                 stdin=subprocess.DEVNULL,
-                # An engine may print there.
+                # The engine may print to stdout and stderr.
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 pass_fds=(sender,),
             )
         except OSError as error:
             raise ModelError(
-                f"{folder}: expected a process for the self-test, found none: {error.strerror}"
+                f"{folder}: cannot start a process for the self-test: {error.strerror}"
             ) from None
         finally:
             os.close(sender)
@@ -119,8 +119,8 @@ def verify_bundle(
             code = process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             raise ModelError(
-                f"{folder}: expected loading and self-test within {timeout_s:g} s, found them "
-                "still at work (--timeout for a slow machine)"
+                f"{folder}: loading and self-test did not end within {timeout_s:g} s; on a slow "
+                "machine, give a longer --timeout"
             ) from None
         answer = answers.read(_LONGEST_ANSWER) or b""
     return _judged(folder, code, answer)
@@ -129,9 +129,7 @@ def verify_bundle(
 def _judged(folder: Path, code: int, answer: bytes) -> Verdict:
     if code != 0 or not answer:
         how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-        raise ModelError(
-            f"{folder}: expected a model that loads and answers, found its process ended {how}"
-        )
+        raise ModelError(f"{folder}: the process that loads and tests the model ended {how}")
     found = json.loads(answer)
     if "verdict" in found:
         return Verdict(**found["verdict"])
@@ -141,7 +139,7 @@ def _judged(folder: Path, code: int, answer: bytes) -> Verdict:
 
 
 def child() -> None:
-    """Answer the order in ``sys.argv`` on the pipe it names."""
+    """Run the self-test given in ``sys.argv``, and write the result to the pipe named there."""
     sender, order = int(sys.argv[1]), json.loads(sys.argv[2])
     try:
         verdict = _selftest(**order)
@@ -151,13 +149,13 @@ def child() -> None:
     except MemoryError:
         answer = {
             "exit_code": ModelError.exit_code,
-            "message": f"{order['folder']}: expected a model of bearable size, found no memory",
+            "message": f"{order['folder']}: not enough memory to load and test the model",
         }
-    except Exception:  # noqa: BLE001 - a defect of ours is shown by whoever asked
+    except Exception:  # noqa: BLE001 - the parent process reports a defect
         answer = {"defect": traceback.format_exc()[-_LONGEST_DEFECT:]}
     with os.fdopen(sender, "wb") as stream:
         stream.write(json.dumps(answer).encode())
-    # Whatever a model left running ends here.
+    # Ends threads that a model may have left running.
     os._exit(0)
 
 
@@ -192,13 +190,13 @@ def _selftest(
 
 
 def _limit(model_bytes: int, threads: int, timeout_s: float) -> None:
-    """Bound this process's memory, and its processor time should nobody be left to end it."""
+    """Limit this process's memory, and its processor time in case the parent dies."""
     stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
     stacks = threads * (_STACK_BYTES if stack == resource.RLIM_INFINITY else stack)
     _lower(resource.RLIMIT_DATA, _BASE_BYTES + stacks + _PER_MODEL_BYTE * model_bytes)
     _lower(resource.RLIMIT_CPU, int(timeout_s * (os.cpu_count() or 1)) + 1)
     _lower(resource.RLIMIT_CORE, 0)
-    # Where the machine itself has less, this process is the first to go.
+    # If the machine runs out of memory, this process is killed first.
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000", "ascii")
 

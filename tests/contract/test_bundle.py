@@ -98,14 +98,14 @@ REFUSED = [
     (("pose", "standard_deviation", 0), 1e9, "standard_deviation"),
     (("thresholds",), [], "thresholds"),
     (("thresholds", 0, "confidence"), 1.0, "confidence"),
-    (("thresholds", 4), ..., "found none for 0.9"),
+    (("thresholds", 4), ..., "missing 0.9"),
     (("thresholds", 0, "q_hat"), [1, 2, 3], "q_hat"),
     (("thresholds", 0, "q_hat", 0), "1", "q_hat"),
-    (("thresholds", 0, "q_hat", 0), 9e8, "growth with the confidence"),
+    (("thresholds", 0, "q_hat", 0), 9e8, "grow with the confidence"),
     (("thresholds", 0, "q_hat", 0), -1.7e308, "q_hat"),
     (("thresholds", 0, "q_hat", 0), 10**19, "q_hat"),
     (("selftest", "outputs", "pose", 0), 1e9, "selftest.outputs"),
-    (("thresholds", 0, "q_hat", 0), None, "growth with the confidence"),
+    (("thresholds", 0, "q_hat", 0), None, "grow with the confidence"),
     (("calibration", "n"), 0, "calibration.n"),
     (("calibration", "n"), -5, "calibration.n"),
     (("calibration", "rule"), "best", "calibration.rule"),
@@ -200,7 +200,9 @@ def test_a_joint_threshold_smaller_than_it_can_be_is_refused(tmp_path, artifacts
     Odometer.load(folder).close()
     smaller = [*least[:5], least[5] - 1e-6]
     (folder / "calibration.json").write_bytes(redigested(with_joint_at(document, 0.5, smaller)))
-    with pytest.raises(CalibrationFileError, match=r"scope joint at 0\.5 at least .* at \[5\]"):
+    with pytest.raises(
+        CalibrationFileError, match=r"scope joint at 0\.5 to be at least .* at \[5\]"
+    ):
         Odometer.load(folder)
 
 
@@ -216,7 +218,9 @@ def test_of_two_sides_each_has_half_of_what_the_joint_scope_may_miss(tmp_path, a
     Odometer.load(folder).close()
     smaller = [least[0] - 1e-6, *least[1:]]
     (folder / "calibration.json").write_bytes(redigested(with_joint_at(document, 0.9, smaller)))
-    with pytest.raises(CalibrationFileError, match=r"joint at 0\.9 at least .* marginal at 0\.8"):
+    with pytest.raises(
+        CalibrationFileError, match=r"joint at 0\.9 to be at least .* marginal at 0\.8"
+    ):
         Odometer.load(folder)
 
 
@@ -354,9 +358,9 @@ def test_what_would_be_refused_is_never_written(bundle):
 
 
 def test_no_folder_and_no_file(tmp_path):
-    with pytest.raises(CalibrationFileError, match="found none"):
+    with pytest.raises(CalibrationFileError, match="no such folder"):
         read_calibration(tmp_path / "nowhere")
-    with pytest.raises(CalibrationFileError, match="found none"):
+    with pytest.raises(CalibrationFileError, match="no such file"):
         read_calibration(tmp_path)
 
 
@@ -384,7 +388,7 @@ def test_links_and_fifos_are_never_opened(copied_bundle, bundle_dir, name, error
 
 def test_a_missing_model(copied_bundle):
     (copied_bundle / "model.onnx").unlink()
-    with pytest.raises(ModelError, match="found none"):
+    with pytest.raises(ModelError, match="no such file"):
         read_bundle(copied_bundle)
 
 

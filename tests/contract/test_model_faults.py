@@ -197,7 +197,9 @@ def test_an_output_of_another_shape_than_declared_fails(bundle, found):
     if found == 6:
         assert session.run(feeds)["lower"].shape == (1, 6)
     else:
-        with pytest.raises(ModelError, match=r"expected lower \[1, 6\], as declared, found"):
+        with pytest.raises(
+            ModelError, match=r"expected the declared shape \[1, 6\] for lower, found"
+        ):
             session.run(feeds)
 
 

@@ -57,7 +57,10 @@ def test_a_bad_argument_ends_with_the_documented_exit_code(tmp_path):
     no_bundle = run_demo(tmp_path, "nowhere")
     no_png = run_demo(tmp_path, "--picture", "picture.jpg")
     assert (no_bundle.returncode, no_png.returncode) == (3, 2)
-    assert no_bundle.stderr == "cvo-edge: nowhere: expected a bundle folder, found none\n"
+    assert no_bundle.stderr == (
+        "cvo-edge: nowhere: no such folder; "
+        "expected a bundle with calibration.json and model.onnx\n"
+    )
     assert "expected a name that ends in .png, found picture.jpg" in no_png.stderr
     assert not list(tmp_path.iterdir())
 
@@ -196,7 +199,7 @@ def test_a_frame_without_interval_or_truth_is_grey_and_a_run_of_them_no_picture(
     degraded = [*estimates[:-1], replace(estimates[-1], conformal_set=unbounded_set())]
     assert count(draw_run(degraded, truths, "title"), grey) > full
     assert count(draw_run(estimates, [*truths[:-1], None], "title"), grey) > full
-    with pytest.raises(UsageError, match="found none in 12"):
+    with pytest.raises(UsageError, match="none of the 12 frames has finite bounds"):
         draw_run(estimates, [None] * 12, "title")
     with pytest.raises(UsageError, match="found 11 for 12 estimates"):
         draw_run(estimates, truths[1:], "title")

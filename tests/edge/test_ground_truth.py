@@ -86,10 +86,10 @@ def test_tum_is_matched_by_the_nearest_stamp_within_twenty_milliseconds(tmp_path
 @pytest.mark.parametrize(
     ("text", "rule"),
     [
-        ("", "found no line"),
+        ("", "found no poses"),
         ("1 2 3\n", "eight numbers"),
         ("0 0 0 0 0 0 0 0\n", "eight numbers"),
-        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "growing stamps"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "increasing stamps"),
         ("nan 0 0 0 0 0 0 1\n", "eight numbers"),
         ("1" * 5001 + " 0 0 0 0 0 0 1\n", "eight numbers"),
         ("-1e300 0 0 0 0 0 0 1\n", "eight numbers"),
@@ -104,12 +104,12 @@ def test_a_broken_trajectory_names_the_rule(tmp_path, text, rule):
 
 
 def test_no_ground_truth_is_refused(tmp_path):
-    with pytest.raises(SourceError, match="found no valid one"):
+    with pytest.raises(SourceError, match="found no valid file"):
         open_ground_truth(tmp_path)
     os.mkfifo(tmp_path / "fifo")
     with pytest.raises(SourceError, match="expected a TUM trajectory"):
         open_ground_truth(tmp_path / "none.txt")
-    with pytest.raises(SourceError, match="expected a regular file"):
+    with pytest.raises(SourceError, match="not a regular file"):
         open_ground_truth(tmp_path / "fifo")
 
 

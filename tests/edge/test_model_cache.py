@@ -344,7 +344,7 @@ def test_the_list_says_why_a_cache_is_not_used(bundle_dir, cache):
     read_bundle(bundle_dir, cache=cache)
     assert cache.obstacle() is None
     cache.folder.chmod(0o775)
-    assert "nobody else may write to" in (cache.obstacle() or "")
+    assert "writable only by this user" in (cache.obstacle() or "")
     assert any(line.startswith("not used") for line in cache_lines(cache))
 
 

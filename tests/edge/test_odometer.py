@@ -164,7 +164,7 @@ def test_a_forked_process_loads_its_own(bundle_dir, clip_dir, what, code):
         check=False,
     )
     assert done.returncode == code, done.stderr
-    assert ("found one forked from it" in done.stdout) == (what == "step")
+    assert ("load it again in this process" in done.stdout) == (what == "step")
 
 
 def test_a_path_is_no_stream(bundle_dir, clip_dir):

@@ -275,10 +275,10 @@ def test_a_whole_line_that_is_no_record_is_named(recorded, tmp_path, line):
     wrong.write_bytes(content[:place] + line + content[place:])
     records = read_records(wrong)
     assert next(records).seq == 0
-    with pytest.raises(SourceError, match="expected a record in line 3"):
+    with pytest.raises(SourceError, match="line 3 is not a record"):
         next(records)
     wrong.write_bytes(line)
-    with pytest.raises(SourceError, match="expected a record in line 1"):
+    with pytest.raises(SourceError, match="line 1 is not a record"):
         read_records(wrong)
 
 

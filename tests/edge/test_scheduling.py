@@ -288,4 +288,4 @@ def test_a_mode_on_the_command_line(bundle_dir, clip_dir):
     records = [json.loads(line) for line in result.stdout.splitlines()[1:]]
     left_out = 50 - len(records)
     assert records[-1]["seq"] == 49
-    assert (f"skipped     {left_out} frames" in result.stderr) == (left_out > 0)
+    assert (f"dropped     {left_out} frames" in result.stderr) == (left_out > 0)

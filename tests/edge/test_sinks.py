@@ -301,7 +301,7 @@ def test_one_file_has_one_writer(tmp_path, estimates):
     path = tmp_path / "a.jsonl"
     with Sink(str(path), "jsonl") as sink:
         sink.write(estimates[0])
-        with pytest.raises(SinkError, match="no other run writes to"):
+        with pytest.raises(SinkError, match="another run is writing to this file"):
             Sink(str(path), "jsonl")
         sink.write(estimates[1])
     assert len(path.read_text().splitlines()) == 2

@@ -87,7 +87,9 @@ def test_an_interrupted_run_ends_as_if_it_never_was(runs, method, tmp_path):
     # For CQR in the second of its four lessons, for MCQR in the last of its five.
     calls = {"cqr": 50, "csp": 25, "mcqr": 170}[method]
     with pytest.raises(InterruptedTrainingError):
-        train(tmp_path / "run", tiny_config(head=CONFIGS[method]), stopping_after(calls, "training"))
+        train(
+            tmp_path / "run", tiny_config(head=CONFIGS[method]), stopping_after(calls, "training")
+        )
     resumed = train(tmp_path / "run", tiny_config(head=CONFIGS[method]), ignore_progress)
     assert same_weights(run, resumed)
     assert run.history == resumed.history

@@ -68,9 +68,9 @@ def test_a_signed_bundle_is_taken_and_its_version_remembered(copied_bundle, keys
 
 
 def test_an_unsigned_bundle_is_refused(bundle_dir, keys):
-    with pytest.raises(BundleMismatchError, match=r"signature\.json: expected a file, found none"):
+    with pytest.raises(BundleMismatchError, match=r"signature\.json: no such file"):
         load(bundle_dir, keys[1])
-    with pytest.raises(BundleMismatchError, match=r"signature\.json: expected a file, found none"):
+    with pytest.raises(BundleMismatchError, match=r"signature\.json: no such file"):
         verify_bundle(bundle_dir, threads=1, public_key=keys[1])
 
 
@@ -84,7 +84,7 @@ def test_a_signature_with_another_key_is_refused(copied_bundle, keys, tmp_path):
     ours = sign(copied_bundle, keys[0]).key
     sign(copied_bundle, foreign)
     path.write_text(json.dumps({**json.loads(path.read_text()), "key": ours}))
-    with pytest.raises(BundleMismatchError, match="found one that does not fit it"):
+    with pytest.raises(BundleMismatchError, match="the signature is not valid for"):
         load(copied_bundle, keys[1])
 
 
@@ -140,7 +140,7 @@ def test_another_bundle_s_files_are_refused(copied_bundle, artifacts_dir, keys):
     with pytest.raises(BundleMismatchError, match="expected sha256"):
         load(copied_bundle, public)
     shutil.copy(other / CALIBRATION_FILE, copied_bundle)
-    with pytest.raises(BundleMismatchError, match="expected a signature of synthetic-room-cqr"):
+    with pytest.raises(BundleMismatchError, match="expected a signature for synthetic-room-cqr"):
         load(copied_bundle, public)
 
 
@@ -168,11 +168,11 @@ def test_a_record_of_versions_that_cannot_be_read_or_written_stops_it(copied_bun
     sign(copied_bundle, secret, 5)
     state.parent.mkdir()
     state.write_text("{")
-    with pytest.raises(BundleMismatchError, match=r"versions\.json: expected the versions"):
+    with pytest.raises(BundleMismatchError, match=r"versions\.json: the record of versions"):
         load(copied_bundle, public)
     for content in (b'{"\xff": {"a": 1}}', b"[" * 100_000, b'{"a": 1}', b""):
         state.write_bytes(content)
-        with pytest.raises(BundleMismatchError, match=r"versions\.json: expected the versions"):
+        with pytest.raises(BundleMismatchError, match=r"versions\.json: the record of versions"):
             load(copied_bundle, public)
     state.unlink()
     state.mkdir()
