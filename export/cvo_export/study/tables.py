@@ -167,7 +167,7 @@ class Tables:
                     *(self.joint_sets(found[0]) for found in columns.values()),
                 ],
                 row("disjoint bands: share of sets in pieces", pieces_shown),
-                ["complexity: ms a frame", *map(self.milliseconds, columns.values())],
+                ["complexity: ms per frame", *map(self.milliseconds, columns.values())],
                 row("complexity: millions of parameters", _millions),
                 row("complexity: MiB of the model", _mebibytes),
                 *rows_of(
