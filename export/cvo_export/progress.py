@@ -12,10 +12,10 @@ Stage = Literal["features", "training", "fine-tuning"]
 
 
 class Progress(Protocol):
-    """Called by training as it advances."""
+    """Callback that training calls as it advances."""
 
     def __call__(self, stage: Stage, done: int, total: int, note: str = "", /) -> None:
-        """Report that ``done`` of ``total`` steps of a stage are finished; ``note`` is shown."""
+        """Report that ``done`` of ``total`` steps of a stage are finished, with a ``note``."""
 
 
 _SECONDS_BETWEEN_LINES = 15.0
@@ -23,7 +23,7 @@ _SECONDS_BETWEEN_LINES = 15.0
 
 @contextmanager
 def show_progress() -> Iterator[Progress]:
-    """Yield the ``Progress`` that a user sees."""
+    """Yield a ``Progress`` that shows bars or lines."""
     if sys.stderr.isatty():
         with _bar() as progress:
             yield progress
@@ -45,7 +45,7 @@ def _bar() -> Iterator[Progress]:
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=total)
             elif done < last[stage]:
-                # The next lesson, or the next set of features, begins.
+                # A new lesson or a new set of features begins.
                 bars.reset(tasks[stage])
             last[stage] = done
             text = _text(stage, note)

@@ -47,9 +47,9 @@ def test_pooling_of_a_constant_map_is_constant_on_every_grid():
 @pytest.mark.parametrize(
     ("changes", "rule"),
     [
-        ({"name": "no_such_net"}, "backbone: expected a model of timm, found no_such_net"),
-        ({"name": "a/b"}, "backbone: expected a model of timm, found a/b"),
-        ({"name": "local-dir:/none"}, "backbone: expected a model of timm, found local-dir"),
+        ({"name": "no_such_net"}, "backbone: expected a timm model, found no_such_net"),
+        ({"name": "a/b"}, "backbone: expected a timm model, found a/b"),
+        ({"name": "local-dir:/none"}, "backbone: expected a timm model, found local-dir"),
         ({"stages": ("7",)}, "stages: expected some of 2, 4, 8, 16, 32"),
         ({"stages": ("final", "16")}, "stages"),
         ({"grid": (9, 9)}, "grid: expected at most 4x6"),
@@ -76,7 +76,7 @@ def test_wrong_weights_are_refused(tmp_path):
     with pytest.raises(UsageError, match="found none"):
         load_weights(backbone(), str(path))
     path.write_bytes(b"not safetensors")
-    with pytest.raises(UsageError, match="expected safetensors"):
+    with pytest.raises(UsageError, match="not a valid safetensors file"):
         load_weights(backbone(), str(path))
     save_file({"conv_stem.weight": torch.zeros(1)}, path)
     with pytest.raises(UsageError, match="tensors missing and 1 of another shape"):

@@ -225,7 +225,7 @@ def test_an_option_of_another_method_is_refused():
         ("csp", {"classes": 1}, "classes"),
         ("mcqr", {"augmentation": "labels", "dropout": 0.0}, "dropout: expected more than 0"),
         ("mcqr", {"kappa": 0.0}, "kappa"),
-        ("mcqr", {"passes": 5}, "passes: expected with the augmentation"),
+        ("mcqr", {"passes": 5}, "passes: expected only with augmentation"),
         ("nothing", {}, "expected one of cjp, cqr, csp"),
     ],
 )

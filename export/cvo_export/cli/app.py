@@ -1,4 +1,4 @@
-"""The command line ``cvo-export``: the program, and the options that several commands share."""
+"""The program ``cvo-export``, and the options that several commands share."""
 
 from __future__ import annotations
 
@@ -116,4 +116,4 @@ def _root(
         typer.Option("--version", callback=_version, is_eager=True, help="Print the versions."),
     ] = False,
 ) -> None:
-    """Options that need no command."""
+    """Define the options of the program itself."""

@@ -1,4 +1,4 @@
-"""``cvo-export evaluate``, ``plot``, ``render``, ``dataset``: look at bundles and data sets."""
+"""``cvo-export evaluate``, ``plot``, ``render``, ``dataset``: inspect bundles and data sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``cvo-export compare`` and ``study``: many runs at once."""
+"""``cvo-export compare`` and ``study``: commands that run many trainings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``cvo-export train``: its options, the methods' own among them."""
+"""``cvo-export train`` with its options, including the methods' options."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _train(
     from cvo_export.training.configure import configure, head_config
     from cvo_export.training.loop import train
 
-    # Options of another method are refused before any data is opened.
+    # Check the method's options before opening any data.
     head_config(method, options)
     found = opened(dataset)
     config = configure(
@@ -132,12 +132,12 @@ def _train(
 
 
 class _TrainCommand(TyperCommand):
-    """Gets its parameters when they are first needed: the methods' options import torch."""
+    """Builds its parameters on demand: the methods' options import torch."""
 
     _built = False
 
     def get_params(self, ctx: typer.Context) -> list[Any]:  # type: ignore[override]
-        """Return the command's parameters, those of the registered methods included."""
+        """Return the command's parameters, including those of the registered methods."""
         if not self._built:
             self._built = True
             complete = _with_method_options()
@@ -176,4 +176,4 @@ def _with_method_options() -> TyperCommand:
     help=_train.__doc__,
 )
 def train() -> None:
-    """Be listed; ``_TrainCommand`` has the parameters."""
+    """Register the command; ``_TrainCommand`` defines its parameters."""

@@ -1,1 +1,1 @@
-"""Networks: backbones, heads of the methods, baselines and losses."""
+"""Networks: backbones, the methods' heads, baselines and losses."""

@@ -1,8 +1,8 @@
 """A pretrained image network, cut after a chosen stage, pooled to a small grid.
 
-Any timm model by name. Stopping at the stage of stride 16 and keeping a coarse grid (where in the
-image something is says where the camera is) halves the error of the last layer's global mean and
-costs a quarter of the parameters; that mean stays selectable as stage ``final`` with grid 1x1.
+Takes any timm model by name. Cutting at the stage of stride 16 and keeping a coarse grid (image
+position carries information about the camera pose) halves the error of the last layer's global mean
+at a quarter of the parameters; stage ``final`` with grid 1x1 selects that global mean.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ NO_WEIGHTS = "none"
 
 @dataclass(frozen=True)
 class BackboneConfig:
-    """Which network, cut where, pooled how.
+    """Which network to use, where to cut it, and how to pool its features.
 
     Attributes
     ----------
     name
-        Any model name of timm.
+        Any timm model name.
     stages
         Strides of the stages whose features are used, e.g. ("16",), or ("final",) for the network's
-        own last features.
+        last features.
     grid
         Rows and columns that each stage is averaged to.
     normalisation
-        ``half``: (pixel - 127.5) / 127.5; ``timm``: the mean and deviation of the model's timm
+        ``half``: (pixel - 127.5) / 127.5; ``timm``: mean and deviation from the model's timm
         configuration.
     """
 
@@ -54,24 +54,24 @@ class BackboneConfig:
 class Backbone(nn.Module):
     """Images (n, height, width, 3), uint8 RGB -> features (n, ``size``), float32.
 
-    Casting, transposing and normalising happen inside, so that they become part of the exported
-    graph: exact there, and free.
+    Casting, transposing and normalising are part of the exported graph, where they are exact and
+    free.
     """
 
     def __init__(self, config: BackboneConfig, height: int, width: int) -> None:
         super().__init__()
         self.config = config
         try:
-            # timm's models share methods that nn.Module does not declare.
+            # nn.Module does not declare the methods that timm's models share.
             self.body: Any = timm.create_model(config.name, pretrained=False, num_classes=0)
-        # Names may lead to folders and servers, which fail in their own ways.
+        # A name may point to a folder or a server, each with its own errors.
         except (RuntimeError, ValueError, OSError) as error:
             line = next(iter(str(error).splitlines()), type(error).__name__)
             raise UsageError(
-                f"backbone: expected a model of timm, found {config.name}: {line}"
+                f"backbone: expected a timm model, found {config.name}: {line}"
             ) from None
         if not hasattr(self.body, "prune_intermediate_layers"):
-            raise UsageError(f"backbone: expected a network with stages, found {config.name}")
+            raise UsageError(f"backbone: {config.name} has no stages; choose another model")
         mean, std = _mean_std(self.body, config.normalisation)
         self.mean, self.std = mean, std
         self.register_buffer("_mean", torch.tensor(mean).view(1, 3, 1, 1) * 255.0)
@@ -85,7 +85,7 @@ class Backbone(nn.Module):
                 maps = self.eval().maps(blank)
         except (AssertionError, RuntimeError) as error:
             raise UsageError(
-                f"backbone: expected {config.name} to take {width}x{height} images, found {error}"
+                f"backbone: {config.name} does not accept {width}x{height} images: {error}"
             ) from None
         self.map_shapes = [tuple(int(size) for size in m.shape[1:]) for m in maps]
         for number, (_, map_height, map_width) in enumerate(self.map_shapes):
@@ -108,9 +108,9 @@ class Backbone(nn.Module):
         if unknown or not self.config.stages:
             raise UsageError(
                 f"stages: expected some of {', '.join(dict.fromkeys(strides))} for "
-                f"{self.config.name}, or {FINAL} alone, found {', '.join(unknown) or 'none'}"
+                f"{self.config.name}, or {FINAL} alone, found {', '.join(unknown) or 'no stage'}"
             )
-        # Where stages share a stride the last one has seen most.
+        # Of several stages with the same stride, use the deepest.
         last = {stride: index for index, stride in enumerate(strides)}
         indices = sorted(last[stage] for stage in self.config.stages)
         self.body.prune_intermediate_layers(indices=indices, prune_head=True)
@@ -131,7 +131,7 @@ class Backbone(nn.Module):
         pooled = []
         for number, feature_map in enumerate(self.maps(image)):
             if self.config.grid == (1, 1):
-                # A product for each channel takes ten times as long.
+                # One matrix product per channel takes ten times as long.
                 pooled.append(feature_map.mean(dim=(2, 3)))
                 continue
             rows = getattr(self, f"_rows{number}")
@@ -143,8 +143,8 @@ class Backbone(nn.Module):
 def load_weights(backbone: Backbone, weights: str) -> str | None:
     """Fill the backbone from a safetensors file, ``timm`` (downloads), or ``none`` (random).
 
-    Returns the sha256 of what was loaded, None for random weights. Keys are those of the timm
-    model without classifier; layers behind the cut are ignored, a missing one is refused.
+    Returns the sha256 of the loaded weights, None for random weights. Keys are those of the timm
+    model without classifier; weights of layers after the cut are ignored, missing ones rejected.
 
     Raises UsageError.
     """
@@ -156,7 +156,7 @@ def load_weights(backbone: Backbone, weights: str) -> str | None:
         except (RuntimeError, OSError) as error:
             line = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise UsageError(
-                f"weights: expected timm to fetch those of {backbone.config.name}, found {line}; "
+                f"weights: cannot download those of {backbone.config.name}: {line}; "
                 "give --weights FILE"
             ) from None
         state = whole.state_dict()
@@ -167,11 +167,11 @@ def load_weights(backbone: Backbone, weights: str) -> str | None:
     else:
         path = Path(weights)
         if not path.is_file():
-            raise UsageError(f"weights: expected a safetensors file, found none at {path}")
+            raise UsageError(f"weights: expected a safetensors file, found no file at {path}")
         try:
             state = load_file(path)
         except Exception as error:  # noqa: BLE001 - safetensors raises its own untyped errors
-            raise UsageError(f"weights: {path}: expected safetensors, found {error}") from None
+            raise UsageError(f"weights: {path}: not a valid safetensors file: {error}") from None
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     wanted = backbone.body.state_dict()
     missing = [name for name in wanted if name not in state]
@@ -180,7 +180,7 @@ def load_weights(backbone: Backbone, weights: str) -> str | None:
         raise UsageError(
             f"weights: expected those of {backbone.config.name}, found "
             f"{len(missing)} tensors missing and {len(wrong)} of another shape, "
-            f"{(missing + wrong)[0]} first"
+            f"the first is {(missing + wrong)[0]}"
         )
     backbone.body.load_state_dict({name: state[name] for name in wanted})
     return sha256
@@ -194,10 +194,10 @@ def _mean_std(body: nn.Module, normalisation: Normalisation) -> tuple[list[float
 
 
 def _averaging(size: int, cells: int) -> Tensor:
-    """Matrix (cells, size) of the means over ``cells`` equal spans; a pixel may be shared.
+    """Matrix (cells, size) of the means over ``cells`` equal spans; spans may share a pixel.
 
-    A product with a constant matrix exports to any runtime, whatever the sizes; adaptive pooling
-    does only where they divide.
+    A product with a constant matrix exports to any runtime for all sizes; adaptive pooling does so
+    only for sizes that ``cells`` divides.
     """
     edges = np.linspace(0.0, size, cells + 1)
     pixel = np.arange(size)

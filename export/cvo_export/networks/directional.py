@@ -1,27 +1,26 @@
 """Directional quantile regression in the latent space of a conditional variational autoencoder.
 
 Feldman, Bates and Romano 2021 (arXiv 2110.00816). Given a condition c and a response y in R^d, an
-autoencoder turns y into z in R^3, where the distribution is near a ball whatever shape it has in
-R^d. For each of D directions u on the sphere a network gives the quantile q(c, u) of u.z, and
+autoencoder maps y to z in R^3, where the distribution is close to a ball whatever its shape in R^d.
+For each of D directions u on the sphere a network predicts the quantile q(c, u) of u.z, and
 
     {z : u.z >= q(c, u) for all u}
 
-is a region; decoded, it may be a ring, a banana or two pieces. What is ours:
+is a region; decoded, it may be a ring, a banana or two pieces. This module differs from the paper:
 
 - q(c, u) = u.zbar(c) - softplus(h(c, u)) with a centre zbar(c), the conditional mean of z: the
   centre is always inside, whether or not the latent is centred at 0;
-- all directions are trained at every step;
-- beside it a lower triangular matrix B(c) with y = B(c) v: the scale and lean of this condition's
-  responses, the scale matrix of a multivariate t distribution with 5 degrees of freedom, trained by
-  its likelihood. The autoencoder works on v;
-- the region is not a grid but a codebook of one size: rays from the centre, cut where they leave
-  the region, times kappa, at three shells. ``grid`` codebooks, as in the paper, are there to check
-  it: all points of a latent grid that lie inside;
-- where that makes val's regions smaller, points that are the nearest to hardly any training
-  response are left out: they stand where the ball in latent space covers a gap, such as the middle
-  of a ring;
-- where responses are no such shape a codebook is worth nothing beside B(c): ``thrifty_choice``
-  leaves as few points as it can.
+- every step trains all directions;
+- a lower triangular matrix B(c) with y = B(c) v models the scale and correlation of the responses:
+  it is the scale matrix of a multivariate t distribution with 5 degrees of freedom, trained by
+  maximum likelihood. The autoencoder works on v;
+- the region is a codebook of fixed size instead of a grid: rays from the centre, cut where they
+  leave the region and multiplied by kappa, at three shells. ``grid_codebook``, as in the paper,
+  serves as a check: all points of a latent grid that lie inside;
+- points that are the nearest to hardly any training response are removed if that makes val's
+  regions smaller: they lie where the ball in latent space covers a gap, e.g. the middle of a ring;
+- if the responses have no such shape, a codebook adds nothing to B(c): ``thrifty_choice`` keeps as
+  few points as possible.
 """
 
 from __future__ import annotations
@@ -45,19 +44,19 @@ Array = NDArray[np.float64]
 
 LATENT = 3
 
-# Where on a ray the codebook has points, beside the centre.
+# Positions of the codebook points along a ray; the centre is an additional point.
 SHELLS = (0.35, 0.7, 1.0)
-# Inflations of the region, before it is conformalised, that val chooses among.
+# Inflations of the region, before calibration, that val chooses from.
 KAPPAS = (0.2, 0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0)
 # A ray nearly parallel to a half-space never leaves it.
 _PARALLEL = 1e-3
 _LEAST_RADIUS = 1e-3
-# A point of the codebook that is the nearest to less than this, of its even share, is left out.
+# Remove a codebook point that is the nearest to less than this fraction of its even share.
 _LEAST_SHARE = 0.1
-# Volume to the power 1/d that a smaller codebook may cost.
+# Accepted increase of volume^(1/d) for a smaller codebook.
 _HARDLY = 1.02
 _TAIL = 5.0
-# Responses this many scales out say no more of the shape.
+# Clip responses at this many scales: further out they say nothing about the shape.
 _FAR = 20.0
 
 
@@ -67,17 +66,17 @@ class RegionConfig(NamedTuple):
     Attributes
     ----------
     response, condition
-        Dimensions of y and c.
-    directions, rays
-        D, directions whose quantiles are learned; rays of the codebook.
-    tau
-        Level of the directional quantiles.
-    kl_weight
-        beta of the autoencoder.
-    dropout
-        Behind the hidden layers while training.
-    local_scale
-        Whether B depends on c; else it is the identity.
+            Dimensions of y and c.
+        directions, rays
+            D, the number of directions whose quantiles are learned; number of rays of the codebook.
+        tau
+            Level of the directional quantiles.
+        kl_weight
+            beta of the autoencoder.
+        dropout
+            Dropout rate after the hidden layers during training.
+        local_scale
+            Whether B depends on c; otherwise it is the identity.
     """
 
     response: int
@@ -120,7 +119,7 @@ class RegionNetwork(nn.Module):
         ray = torch.arange(config.rays)
         self.register_buffer("ray", torch.cat([ray[:1], *(ray for _ in SHELLS)]))
         self.ray: Tensor
-        # Then no ray is needed.
+        # A codebook that consists of the centre only needs no rays.
         self.centre_alone = False
 
     def scale(self, c: Tensor) -> Tensor:
@@ -129,7 +128,7 @@ class RegionNetwork(nn.Module):
         if not self.config.local_scale:
             return torch.eye(d).expand(len(c), d, d)
         spread = self.spread(c)
-        # Beyond e^4 either way a condition has not been seen in training.
+        # Clamp to e^+-4: training data never go beyond.
         diagonal = torch.exp(spread[:, :d].clamp(-4.0, 4.0))
         lean = (spread[:, d:] @ self.place).reshape(-1, d, d)
         scale: Tensor = diagonal[:, :, None] * (lean + torch.eye(d))
@@ -149,15 +148,15 @@ class RegionNetwork(nn.Module):
         return self._decoded(z, c)
 
     def keep(self, points: Tensor) -> None:
-        """Leave out all other points of the codebook; indices in ascending order."""
+        """Keep only these points of the codebook; indices in ascending order."""
         self.shells, self.ray = self.shells[points], self.ray[points]
         self.centre_alone = points.tolist() == [0]
 
     def grid_codebook(self, c: Tensor, side: int = 16) -> tuple[Tensor, Tensor]:
-        """All points of a latent grid, decoded, (n, side^3, d), and which are inside, (n, side^3).
+        """All points of a latent grid, decoded, (n, side^3, d), and an inside mask (n, side^3).
 
-        Instead of the range of training latents, as in the paper, the grid spans the reach of the
-        region's furthest ray. Points outside are put at the centre.
+        The paper's grid spans the range of training latents; this one spans the reach of the
+        region's longest ray. Points outside are moved to the centre.
         """
         centre = self.centre(c)
         reach = self._reach(c)
@@ -171,7 +170,7 @@ class RegionNetwork(nn.Module):
     def loss(self, c: Tensor, y: Tensor) -> Tensor:
         """Condition (n, c), response (n, d) -> scalar: scale, autoencoder, centre, quantiles.
 
-        Each part learns from the output of the one before it and sends no gradient back.
+        Each part learns from the output of the previous one and sends no gradient back.
         """
         scale = self.scale(c)
         v = torch.linalg.solve_triangular(scale, y[:, :, None], upper=False)[:, :, 0]
@@ -190,13 +189,13 @@ class RegionNetwork(nn.Module):
         return cast("Tensor", loss)
 
     def _reach(self, c: Tensor) -> Tensor:
-        """Condition (n, c) -> where each ray from the centre leaves the region, (n, rays)."""
+        """Condition (n, c) -> length of each ray from the centre to the boundary, (n, rays)."""
         distance = softplus(self.distance(c))[:, None] * self.leaving
         reach: Tensor = distance.amin(dim=2).clamp(min=_LEAST_RADIUS)
         return reach
 
     def _decoded(self, z: Tensor, c: Tensor) -> Tensor:
-        """Latents (n, J, 3) -> points (n, J, d); the first layer's share of c is computed once."""
+        """Latents (n, J, 3) -> points (n, J, d); computes the first layer's product with c once."""
         first = cast("nn.Linear", self.decoder[0])
         of_z, of_c = first.weight[:, :LATENT], first.weight[:, LATENT:]
         hidden = z @ of_z.T + (c @ of_c.T + first.bias)[:, None]
@@ -205,7 +204,7 @@ class RegionNetwork(nn.Module):
 
 
 class Choice(NamedTuple):
-    """Inflation of a region, and which points of its codebook stay, ascending."""
+    """Inflation of a region, and the codebook points that are kept, ascending."""
 
     kappa: float
     points: NDArray[np.int64]
@@ -217,7 +216,7 @@ def best_choice(
     val: tuple[Tensor, Array],
     kappas: Sequence[float] = KAPPAS,
 ) -> Choice:
-    """Return what makes val's regions smallest; train and val are c (n, c) and y (n, d) each."""
+    """Return the choice with the smallest regions on val; train and val are c (n, c), y (n, d)."""
     everything = np.arange(len(network.shells))
     choices = [
         Choice(kappa, points)
@@ -235,8 +234,8 @@ def thrifty_choice(
 ) -> Choice:
     """Return the smallest codebook whose regions on val are hardly larger than the best choice's.
 
-    A codebook costs a decoder's work for every point. Tried are the centre alone, one ellipsoid,
-    and the centre with the outermost shell. Arguments as for ``best_choice``.
+    Every codebook point costs decoder work. The candidates are the centre alone (one ellipsoid) and
+    the centre with the outermost shell. Arguments as for ``best_choice``.
     """
     best = best_choice(network, train, val, kappas)
     limit = _HARDLY * mean_volume(network, *val, best)
@@ -253,7 +252,7 @@ def thrifty_choice(
 
 @torch.no_grad()
 def _used(network: RegionNetwork, c: Tensor, y: Array, kappa: float) -> NDArray[np.int64]:
-    """Points of the codebook that are the nearest to their share of the responses, or a tenth."""
+    """Return the points nearest to at least ``_LEAST_SHARE`` of their even share of responses."""
     v = np.linalg.solve(network.scale(c).double().numpy(), y[:, :, np.newaxis])
     responses = torch.from_numpy(v[:, :, 0]).float()
     codebook = network.codebook(c, torch.tensor(kappa))
@@ -268,7 +267,7 @@ def mean_volume(
 ) -> float:
     """Geometric mean volume of the regions at 90 %, to the power 1/d.
 
-    Condition (n, c), responses (n, d), on which the radius is taken, too.
+    Condition (n, c) and responses (n, d), which also determine the radius.
     """
     codebook = network.codebook(c, torch.tensor(choice.kappa)).double().numpy()
     codebook, scale = codebook[:, choice.points], network.scale(c).double().numpy()
@@ -281,7 +280,7 @@ def mean_volume(
 def scaled_distances(codebook: Array, scale: Array, y: Array) -> Array:
     """Codebook (n, J, d) before B, B (n, d, d), y (n, d) -> distance to the nearest point, (n,).
 
-    Or one codebook and one B for all y.
+    A single codebook and a single B may serve all y.
     """
     v = np.linalg.solve(scale, y[:, :, np.newaxis])[:, np.newaxis, :, 0]
     return np.asarray(np.linalg.norm(codebook - v, axis=2).min(axis=1))

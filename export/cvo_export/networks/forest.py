@@ -1,16 +1,16 @@
-"""Quantile regression forests (Meinshausen 2006): weights, quantiles, and both inside ONNX.
+"""Quantile regression forests (Meinshausen 2006): weights and quantiles, in numpy and in ONNX.
 
 A forest of T trees gives every training row i a weight at x,
 
     w_i(x) = 1/T sum_t 1{row i in the leaf of x in tree t} / rows in that leaf,
 
-over *all* rows, in the bag of a tree or not; F(y | x) = sum_i w_i(x) 1{y_i <= y} and the quantile
-at tau is the smallest y_i with F(y_i | x) >= tau. scikit-learn grows the trees; everything after
-that is here, once in numpy and once as a graph of standard operators.
+over *all* rows, whether or not they are in a tree's bag; F(y | x) = sum_i w_i(x) 1{y_i <= y} and
+the quantile at tau is the smallest y_i with F(y_i | x) >= tau. scikit-learn grows the trees; this
+module does the rest, once in numpy and once as a graph of standard operators.
 
-The library quantile-forest aggregates differently: by default it keeps one random row a leaf, pools
-leaves without weights and interpolates between labels; and it knows only the rows in a tree's bag.
-With all rows kept, leaves weighted and no bootstrap it agrees up to the interpolation.
+The library quantile-forest aggregates differently: by default it keeps one random row per leaf,
+pools leaves without weights, interpolates between labels, and uses only the rows in a tree's bag.
+With all rows kept, weighted leaves and no bootstrap it agrees up to the interpolation.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ Array = NDArray[np.float64]
 
 ML_DOMAIN, ML_OPSET = "ai.onnx.ml", 3
 
-# Weights are multiples of 1/(T rows): a sum that reaches tau exactly must not miss it by rounding.
+# Tolerance: weights are multiples of 1/(T rows), and a sum equal to tau must not fail by rounding.
 TAU_TOLERANCE = 1e-6
-# Entries of all leaf lists together: 400k cost 0.6 ms a frame and 80 MB at load.
+# Total entries of all leaf lists: 400k cost 0.6 ms per frame and 80 MB at load.
 MAX_LEAF_ENTRIES = 400_000
 
 
@@ -41,12 +41,12 @@ class Forest:
     Attributes
     ----------
     feature, threshold, left, right
-        Per node of all trees: a row goes left where x[feature] <= threshold (float32), else right;
-        feature is -1 at leaves. Children are numbers of nodes.
+        Per node of all trees: a row goes left if x[feature] <= threshold (float32), otherwise
+        right; feature is -1 at leaves. Children are node indices.
     root
-        Per tree its first node.
+        First node of each tree.
     leaf
-        Shape (trees, rows): the node in which each training row ends.
+        Shape (trees, rows): the leaf node of each training row.
     labels
         Shape (rows, outputs), float32.
     """
@@ -65,7 +65,7 @@ class Forest:
         return len(self.labels)
 
     def leaves(self, x: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Inputs (n, features) -> the node each ends in, (trees, n)."""
+        """Inputs (n, features) -> leaf node in each tree, (trees, n)."""
         found = []
         for root in self.root:
             node = np.full(len(x), root)
@@ -77,7 +77,7 @@ class Forest:
         return np.stack(found)
 
     def weights(self, x: NDArray[np.float32]) -> Array:
-        """Inputs (n, features) -> w (n, rows), float64; each row adds up to 1."""
+        """Inputs (n, features) -> w (n, rows), float64; each row sums to 1."""
         total = np.zeros((len(x), self.rows))
         for found, own in zip(self.leaves(x), self.leaf, strict=True):
             together = found[:, np.newaxis] == own[np.newaxis, :]
@@ -105,11 +105,10 @@ def grow(
     share: float,
     seed: int,
 ) -> Forest:
-    """Grow a forest of inputs (rows, features) and labels (rows, outputs).
+    """Grow a forest from inputs (rows, features) and labels (rows, outputs).
 
-    ``scale`` (outputs,) makes the labels comparable where a split weighs one against another;
-    ``share`` of the features is tried at each split. Of too many rows a random part is taken, see
-    ``MAX_LEAF_ENTRIES``.
+    ``scale`` (outputs,) makes the labels comparable in the split criterion; each split tries
+    ``share`` of the features. Above ``MAX_LEAF_ENTRIES``, a random subset of the rows is used.
     """
     most = max(1, MAX_LEAF_ENTRIES // trees)
     if len(x) > most:
@@ -122,7 +121,7 @@ def grow(
 
 
 def forest_of(grown: RandomForestRegressor, x: NDArray[np.float32], y: Array) -> Forest:
-    """Take the trees of a fitted forest, and hang rows (rows, features) and labels into them."""
+    """Copy the trees of a fitted forest; assign rows (rows, features) and labels to leaves."""
     parts: dict[str, list[NDArray[np.generic]]] = {name: [] for name in ("f", "t", "l", "r")}
     roots, leaves, start = [], [], 0
     for estimator in grown.estimators_:
@@ -148,14 +147,14 @@ def forest_of(grown: RandomForestRegressor, x: NDArray[np.float32], y: Array) ->
 
 
 def _not_above(threshold: Array) -> NDArray[np.float32]:
-    """The largest float32 not above each number: x <= threshold is then the same for float32 x."""
+    """Largest float32 not above each number: x <= threshold is then unchanged for float32 x."""
     rounded = threshold.astype(np.float32)
     above = rounded.astype(np.float64) > threshold
     return np.where(above, np.nextafter(rounded, np.float32(-np.inf)), rounded)
 
 
 def forest_fields() -> tuple[str, ...]:
-    """Names of the arrays that a forest is."""
+    """Return the names of the arrays that define a forest."""
     return tuple(field.name for field in fields(Forest))
 
 
@@ -165,11 +164,11 @@ def forest_fields() -> tuple[str, ...]:
 def quantile_nodes(
     forest: Forest, taus: Sequence[float], x: str, outputs: Sequence[str], prefix: str
 ) -> tuple[list[NodeProto], list[TensorProto]]:
-    """Nodes and constants that compute the quantiles at ``taus`` of the tensor named ``x``.
+    """Return nodes and constants that compute the quantiles at ``taus`` of the tensor ``x``.
 
     ``x`` is float32 [1, features]; each of ``outputs`` becomes float32 [1, columns of the labels].
-    All other names begin with ``prefix``. One tree ensemble has every row as a target, so that its
-    output is w(x); sums run in float64, as in ``Forest.quantiles``.
+    All other names begin with ``prefix``. One tree ensemble has every row as a target, so that it
+    outputs w(x); sums run in float64, as in ``Forest.quantiles``.
     """
     order = np.argsort(forest.labels, axis=0, kind="stable").T
     columns = order.shape[0]
@@ -215,7 +214,7 @@ def quantile_nodes(
         constants.append(level)
         add("GreaterOrEqual", ["cumulative", f"tau{number}"], f"{prefix}reached{number}")
         add("Cast", [f"reached{number}"], f"{prefix}steps{number}", to=TensorProto.INT32)
-        # Of equal elements ArgMax takes the first.
+        # ArgMax returns the first of equal elements.
         add("ArgMax", [f"steps{number}"], f"{prefix}first{number}", axis=1, keepdims=0)
         add("Add", [f"first{number}", "starts"], f"{prefix}index{number}")
         add("Gather", ["sorted", f"index{number}"], f"{prefix}quantile{number}")
@@ -224,12 +223,12 @@ def quantile_nodes(
 
 
 def _tree_attributes(forest: Forest) -> dict[str, Any]:
-    """Attributes of TreeEnsembleRegressor; nodes are numbered from 0 in each tree."""
+    """Return the TreeEnsembleRegressor attributes; node ids start at 0 in each tree."""
     nodes = np.arange(forest.feature.size)
     tree = np.searchsorted(forest.root, nodes, side="right") - 1
     first = forest.root[tree]
     inner = forest.feature >= 0
-    # One entry a tree and row: in this leaf the row's weight is 1 / (trees * rows in the leaf).
+    # One entry per tree and row: the row weighs 1 / (trees * rows in the leaf) in its leaf.
     leaf = forest.leaf.reshape(-1)
     row = np.tile(np.arange(forest.rows), len(forest.root))
     count = np.bincount(leaf, minlength=nodes.size)

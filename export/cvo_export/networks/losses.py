@@ -1,4 +1,4 @@
-"""The terms of the losses (of the joint one: the paper's Eq. 4 to 6), each beside its source.
+"""Loss terms with their sources; the joint loss is the paper's Eq. 4 to 6.
 
 All take standardised numbers of shape (batch, dof) and return a scalar.
 """
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 IntervalForm = Literal["proper", "mean", "sum"]
 Gate = Literal["corrected", "literal"]
 
-# The paper's two percentiles, 5 % and 95 %, bound an interval of 90 %.
+# The paper's percentiles, 5 % and 95 %, bound a 90 % interval.
 LOW, HIGH = 0.05, 0.95
 COVERAGE = HIGH - LOW
 
@@ -34,7 +34,7 @@ def interval_score_loss(lower: Tensor, upper: Tensor, y: Tensor, form: IntervalF
 
 
 def pinball_loss(quantile: Tensor, y: Tensor, tau: float) -> Tensor:
-    """Koenker and Bassett 1978: its minimiser is the tau quantile of y; any one shape -> scalar."""
+    """Koenker and Bassett 1978: the tau quantile of y minimises it; any one shape -> scalar."""
     above = y - quantile
     return torch.maximum(tau * above, (tau - 1.0) * above).mean()
 
@@ -47,13 +47,13 @@ def kl_divergence(mu: Tensor, log_variance: Tensor) -> Tensor:
 class CombinedCalibrationLoss(nn.Module):
     """COMCAL, Eq. 5c: (1 - lambda) * CAL + lambda * SHARP, per degree of freedom.
 
-    ``corrected`` (default): each bound is gated by *its own* coverage (Chung et al. 2021): where
-    P(y <= Q) is too small Q is pulled up by the truths above it, else down by those below; SHARP
-    counts only while the interval covers more than 90 %. The coverages are running means, as those
-    of one batch of 64 bias the bounds inwards.
+    ``corrected`` (default): each bound is gated by *its own* coverage (Chung et al. 2021): if
+    P(y <= Q) is too small, the truths above Q pull it up, otherwise those below pull it down; SHARP
+    counts only while the interval covers more than 90 %. The coverages are running means, because
+    coverages of a single batch of 64 bias the bounds inwards.
 
     ``literal``: Eq. 5a and 5b as printed, both bounds gated by the *interval's* coverage of the
-    batch: under-coverage raises the lower bound with the upper one. Kept for comparison.
+    batch: under-coverage raises the lower bound along with the upper one. Kept for comparison.
     """
 
     def __init__(self, dof: int, sharpness: float, gate: Gate, rate: float = 0.01) -> None:
@@ -70,7 +70,7 @@ class CombinedCalibrationLoss(nn.Module):
 
     @torch.no_grad()
     def observe(self, lower: Tensor, upper: Tensor, y: Tensor) -> None:
-        """Move the running coverages towards those of a batch."""
+        """Move the running coverages towards the coverages of a batch."""
         for running, hits in (
             (self.below_lower, y <= lower),
             (self.below_upper, y <= upper),
@@ -79,7 +79,7 @@ class CombinedCalibrationLoss(nn.Module):
             running.lerp_(hits.to(running.dtype).mean(dim=0), self.rate)
 
     def forward(self, lower: Tensor, upper: Tensor, y: Tensor) -> Tensor:
-        """Shapes (batch, dof) each -> scalar; in training mode the batch is observed first."""
+        """Shapes (batch, dof) each -> scalar; in training mode, updates the coverages first."""
         if self.training:
             self.observe(lower, upper, y)
         width = upper - lower
@@ -95,5 +95,5 @@ class CombinedCalibrationLoss(nn.Module):
 
 
 def _pull(bound: Tensor, y: Tensor, up: Tensor) -> Tensor:
-    """Mean distance to the truths above the bound where ``up``, else to those below it, (dof,)."""
+    """Mean distance to the truths above the bound if ``up``, otherwise below it, (dof,)."""
     return torch.where(up, torch.relu(y - bound), torch.relu(bound - y)).mean(dim=0)

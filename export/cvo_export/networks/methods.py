@@ -1,4 +1,4 @@
-"""All that can be trained, by name: the methods, and the baselines they are compared with."""
+"""All trainable methods and baselines, by name."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ TRAINABLE: dict[str, Method] = METHODS | BASELINES
 
 
 def options_of(values: Any) -> Struct:  # noqa: ANN401 - what JSON holds
-    """Return a method's options as its own struct; ``method`` names it.
+    """Convert a JSON object to the options struct that its field ``method`` names.
 
-    Raises msgspec.ValidationError where there is no such method, or an option is not its own.
+    Raises msgspec.ValidationError for an unknown method or an option the method does not have.
     """
     known: Any = Union[tuple(method.config for method in TRAINABLE.values())]  # noqa: UP007
     options: Struct = msgspec.convert(values, known)

@@ -1,4 +1,4 @@
-"""What the network learns: six standardised numbers of a pose, and the way back in the graph."""
+"""The network's target: a pose as six standardised numbers, and the inverse in the graph."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Target:
 
     @property
     def chart(self) -> Chart:
-        """The chart whose coordinates are standardised."""
+        """The chart of the coordinates that are standardised."""
         return Chart("tangent_reference", self.reference_q_xyzw)
 
     def coordinates(self, poses: Array) -> Array:
@@ -38,14 +38,14 @@ class Target:
         return self.chart.coordinates(poses, poses)
 
     def standardised(self, poses: Array) -> Array:
-        """Poses (..., 7) -> numbers (..., 6) of mean 0 and deviation 1 over train and fit."""
+        """Poses (..., 7) -> numbers (..., 6) with mean 0 and deviation 1 over train and fit."""
         return (self.coordinates(poses) - self.mean) / self.std
 
 
 def fit_target(poses: Array) -> Target:
-    """Mean rotation, mean and deviation of training poses (n, 7).
+    """Compute mean rotation, mean and deviation of training poses (n, 7).
 
-    Raises UsageError where rotations spread too far for one tangent or a DoF never changes.
+    Raises UsageError if rotations spread too far for one tangent chart or a DoF never changes.
     """
     reference = geometry.mean_rotation(poses[:, 3:])
     coordinates = Chart("tangent_reference", reference).coordinates(poses, poses)
@@ -53,7 +53,7 @@ def fit_target(poses: Array) -> Target:
     if spread > MAX_SPREAD_RAD:
         raise UsageError(
             f"poses: expected rotations within {MAX_SPREAD_RAD:g} rad of their mean, found one at "
-            f"{spread:.2f} rad; the tangent at one reference cannot hold a full turn"
+            f"{spread:.2f} rad; one tangent chart cannot represent a full turn"
         )
     deviation = coordinates.std(axis=0)
     if not (deviation > 1e-6).all():
@@ -65,7 +65,7 @@ def fit_target(poses: Array) -> Target:
 
 
 class PoseDecoder(nn.Module):
-    """Standardised numbers -> metres and radians, and the pose they are."""
+    """Standardised numbers -> coordinates in metres and radians, and poses."""
 
     def __init__(self, target: Target) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The figures of one cell: a run that was trained, calibrated and evaluated."""
+"""The figures of one cell: a run that has been trained, calibrated and evaluated."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ CONFIDENCE = 0.9
 
 
 class Width(Struct, frozen=True, forbid_unknown_fields=True):
-    """Means over three degrees of freedom each: metres, and degrees."""
+    """Mean widths: metres over x, y, z and degrees over the rotations."""
 
     m: float
     deg: float
 
 
 class Figures(Struct, frozen=True, forbid_unknown_fields=True):
-    """Sets of 90 % on the test frames; coverage per DoF, their mean, and of all six at once.
+    """Figures of 90 % sets on the test frames: coverage per DoF, their mean, and jointly.
 
-    Widths and score bound an unbounded side by the workspace; ``unbounded`` is the share of frames
-    that have such a side, None for a network's own bounds, which are finite.
+    Widths and score limit an unbounded side to the workspace; ``unbounded`` is the share of frames
+    with such a side, None for a network's own bounds, which are finite.
     """
 
     coverage: list[float]
@@ -35,7 +35,7 @@ class Figures(Struct, frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, level: Mapping[str, Any]) -> Figures:
-        """Return the figures of one level, or of the own bounds, in a report of ``evaluate``."""
+        """Extract the figures of one level, or of the own bounds, from a report of ``evaluate``."""
 
         def width(key: str) -> Width:
             values = np.array(level[key])
@@ -53,9 +53,9 @@ class Figures(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NoiseFigures(Struct, frozen=True, forbid_unknown_fields=True):
-    """Marginal sets on noisy test frames, at thresholds of clean frames and of noisy ones.
+    """Figures of marginal sets on noisy test frames, with clean and with noisy thresholds.
 
-    Figures are of the frames that passed the checks; ``invalid`` counts the others.
+    They cover the frames that passed the checks; ``invalid`` counts the others.
     """
 
     invalid: int
@@ -65,7 +65,7 @@ class NoiseFigures(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Seconds(Struct, frozen=True, forbid_unknown_fields=True):
-    """Training time, without the features of the pretrained network."""
+    """Training time, excluding the features of the pretrained network."""
 
     processor: float
     wall: float
@@ -85,18 +85,18 @@ class Cell(Struct, frozen=True, forbid_unknown_fields=True):
     joint_volume
         Volume of the joint sets, in standardised units.
     training
-        None for a run that was interrupted, whose time is not known.
+        None for an interrupted run, whose training time is unknown.
     head_parameters, graph_parameters
-        Trained numbers behind the features, and in all; a forest's trees do not count.
+        Trained parameters after the features, and in total; a forest's trees do not count.
     model_bytes
         Size of the ONNX file.
     adaptiveness
         How closely the widths of the marginal sets follow errors; see ``cvo_export.evaluate``.
     pieces
-        Share of the marginal sets that are in pieces; None for methods whose sets never are.
+        Share of marginal sets in pieces; None for methods whose sets are always intervals.
     noise
-        Figures on noisy test frames, by name and strength of the noise; None where no frame passed
-        the checks.
+        Figures on noisy test frames, by name and strength of the noise; None if no frame passed the
+        checks.
     """
 
     method: str

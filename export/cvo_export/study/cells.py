@@ -1,7 +1,7 @@
-"""The cells of a study: one run each, trained, calibrated and evaluated once.
+"""The cells of a study: runs that are trained, calibrated and evaluated once.
 
-A finished cell is a file and is not run again; an interrupted one resumes from its checkpoints.
-Cells run in parallel, each with one thread of torch.
+A finished cell is a file and does not run again; an interrupted one resumes from its checkpoints.
+Cells run in parallel, each with one torch thread.
 """
 
 from __future__ import annotations
@@ -46,33 +46,33 @@ class CellFolder:
 
     @classmethod
     def in_folder(cls, out: Path, features: Path | None) -> CellFolder:
-        """Absolute paths; by default the features are in the folder itself."""
+        """Return absolute paths; by default, ``out`` holds the features as well."""
         return cls(out.resolve(), (features or out / "features").resolve())
 
     def cell(self, name: str) -> Path:
-        """File of a cell's figures."""
+        """Return the file of a cell's figures."""
         return self.out / "cells" / f"{name}.json"
 
     def run(self, name: str) -> Path:
-        """Folder of a run."""
+        """Return the folder of a run."""
         return self.out / "runs" / name
 
     def bundle(self, name: str) -> Path:
-        """Folder of a bundle."""
+        """Return the folder of a bundle."""
         return self.out / "bundles" / name
 
     def read(self, name: str) -> Cell:
-        """Figures of a finished cell; raises UsageError where the file does not hold any."""
+        """Return the figures of a finished cell; raises UsageError if its file is invalid."""
         return read_json(self.cell(name), Cell, "the figures of a cell")
 
     def names(self) -> list[str]:
-        """Names of all finished cells."""
+        """Return the names of all finished cells."""
         return sorted(path.stem for path in self.cell("*").parent.glob("*.json"))
 
     def check_data(self, configs: Mapping[str, TrainConfig]) -> None:
-        """Raise UsageError where a finished cell is of another data set or other weights.
+        """Raise UsageError if a finished cell used other data or weights.
 
-        A cell's name does not tell: the files behind the same path may have changed.
+        A cell's name does not show this: the files at the same path may have changed.
         """
         opened: dict[str, PoseDataset] = {}
         digests: dict[str, str] = {}
@@ -108,12 +108,12 @@ class CellFolder:
         progress: Progress,
         say: Say,
     ) -> dict[str, Cell]:
-        """Run the missing cells; return all.
+        """Run the missing cells and return all cells.
 
-        ``noises`` by name of the cell: the cell is also evaluated on frames with each of them.
+        ``noises`` maps the name of a cell to the noises it is also evaluated with.
 
-        Raises an error of the first failure's kind once all cells have been tried, SinkError where
-        the folder cannot be written.
+        Tries all cells, then raises an error of the first failure's type. Raises SinkError if the
+        folder cannot be written.
         """
         with self._locked():
             missing = {
@@ -158,13 +158,13 @@ class CellFolder:
                 first = next(iter(failures.values()))
                 raise type(first)(
                     f"{self.out}: {len(failures)} of {len(missing)} cells failed "
-                    f"({', '.join(failures)}); the same command tries them again"
+                    f"({', '.join(failures)}); run the same command to retry them"
                 )
             return {name: self.read(name) for name in configs}
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Lock the folder: a second program would write the same runs."""
+        """Lock the folder: a second program would write to the same runs."""
         try:
             self.out.mkdir(parents=True, exist_ok=True)
             lock = (self.out / ".lock").open("w")
@@ -187,9 +187,9 @@ class CellFolder:
 def run_cell(
     folder: CellFolder, name: str, config: TrainConfig, noises: Sequence[str] = ()
 ) -> None:
-    """Train, publish and evaluate one cell, and write its file, whole or not at all.
+    """Train, publish and evaluate one cell, and write its file atomically.
 
-    A finished cell is evaluated with the noises that it lacks.
+    A finished cell is evaluated with the noises it lacks.
     """
     if not folder.cell(name).is_file():
         write_json(folder.cell(name), _finished(folder, name, config))
@@ -208,7 +208,7 @@ def _with_noise(bundle: Path, config: TrainConfig, text: str) -> NoiseFigures | 
     try:
         report = evaluate(bundle, dataset, "test", threads=1, noise=parse_noise(text))
     except SourceError:
-        # The clean frames could be read, so not one of the noisy ones passed the checks.
+        # The clean frames were readable, so no noisy frame passed the checks.
         return None
     again = report["recalibrated"]["levels"]
     return NoiseFigures(
@@ -220,7 +220,7 @@ def _with_noise(bundle: Path, config: TrainConfig, text: str) -> NoiseFigures | 
 
 
 def _left_out(report: Mapping[str, Any]) -> int:
-    """Frames that did not pass the checks."""
+    """Number of frames that did not pass the checks."""
     frames = report["frames"]
     return int(frames["invalid"] + frames["degraded"])
 
@@ -268,14 +268,14 @@ def digest(config: TrainConfig) -> str:
 
 
 def _features_of(config: TrainConfig) -> bytes:
-    """What decides the features of a run: everything but its method."""
+    """Return the options that determine a run's features: all but its method."""
     return msgspec.json.encode({**msgspec.to_builtins(config), "head": None, "steps": 0})
 
 
 class _Clock:
-    """Seconds since the first features were complete, as training reports them.
+    """Seconds since the first features were complete, according to the training progress.
 
-    Features of a fine-tuned backbone are part of the training and count.
+    Features of a fine-tuned backbone count as training.
     """
 
     def __init__(self) -> None:
@@ -283,7 +283,7 @@ class _Clock:
         self._begun = False
 
     def __call__(self, stage: Stage, done: int, total: int, _: str = "") -> None:
-        """As ``Progress``."""
+        """See ``Progress``."""
         if not self._begun and stage == "features" and done == total:
             self._begin = (process_time(), perf_counter())
             self._begun = True

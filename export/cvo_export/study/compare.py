@@ -1,4 +1,4 @@
-"""Methods and baselines side by side: a study of one grid, and its table as text."""
+"""A comparison of methods and baselines: a study of one grid, and its table as text."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ TABLE_FILE = "compare.txt"
 def compare(
     grid: Grid, folder: CellFolder, engine: Engine, progress: Progress, say: Say
 ) -> list[str]:
-    """Run a study of one grid and write ``results.json`` and ``compare.txt``; returns its lines.
+    """Run a study of one grid, write ``results.json`` and ``compare.txt``, and return its lines.
 
-    Raises UsageError where the folder has cells of other options, which the table would leave out;
-    otherwise as ``run_study``.
+    Raises UsageError if the folder has cells of other options, which the table would omit; for
+    other errors see ``run_study``.
     """
     _check_folder(grid, folder)
     lines = table(run_study(_study(grid), folder, engine, progress, say))
@@ -44,7 +44,7 @@ def _study(grid: Grid) -> Study:
 
 
 def _check_folder(grid: Grid, folder: CellFolder) -> None:
-    """Raise UsageError for cells that are not of this grid with any methods and seeds."""
+    """Raise UsageError for cells that belong to this grid under no choice of methods and seeds."""
     names = folder.names()
     earlier = [name for name in names if name.rpartition("-")[0] in TRAINABLE]
     if earlier:
@@ -86,7 +86,7 @@ def table(results: Results) -> list[str]:
     (timing,) = results.timing.values()
     first = results.places[0]
     seeds = sorted({place.seed for place in results.places})
-    # A baseline is used for its own bounds; those of a method are a step on the way to its sets.
+    # Show own bounds for baselines only: a method's own bounds are an intermediate result.
     rows: list[tuple[str, ...]] = [_HEADER]
     for method, cells in by_method.items():
         own = own_shown(cells) if method in BASELINES else None

@@ -1,4 +1,4 @@
-"""Pictures of a study: sets over frames and from above, the tube under noise, and curves."""
+"""Figures of a study: sets over frames and from above, the tube under noise, and curves."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Colours that colour-blind readers can tell apart (Okabe and Ito 2008).
+# A palette for colour-blind readers (Okabe and Ito 2008).
 _LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _COLUMNS = 4
 # More boxes would hide the flight.
 _TUBE_BOXES = 25
-# Share of the flight's extent: smaller boxes cannot be told from its line.
+# Fraction of the flight's extent: smaller boxes are indistinguishable from the line.
 _VISIBLE = 0.06
-# Limit of the axes, in 90 % quantiles of the widest method's sets.
+# Limit of the axes, as a multiple of the widest method's 90 % quantile.
 _REACH = 1.2
 
 
 def comparison(tracks: Mapping[str, Track]) -> Figure:
     """Draw each method's sets of x over the frames, and of x and y from above.
 
-    Both are drawn twice: absolute in metres, and relative to the truth in centimetres, which shows
-    their widths.
+    Both are drawn twice: absolute in metres, and relative to the truth in centimetres to show the
+    widths.
     """
     figure = _figure(3.8 * len(tracks), 13.0)
     axes = figure.subplots(4, len(tracks), squeeze=False)
@@ -43,14 +43,14 @@ def comparison(tracks: Mapping[str, Track]) -> Figure:
         draw_from_above(axes[2, column], track)
         _draw_plane_about_truth(axes[3, column], track, reach)
         axes[0, column].set_title(method)
-        # One scale for all, so that widths can be compared.
+        # Use one scale for all methods so that widths are comparable.
         axes[0, column].set_ylim(axes[0, 0].get_ylim())
         axes[2, column].set_title("")
     return figure
 
 
 def _usual_reach(track: Track) -> float:
-    """90 % quantile of the distances from the truth to the ends of the sets of x, centimetres."""
+    """90 % quantile of the distance from the truth to the ends of the sets of x, centimetres."""
     ends = [(track.estimates[r].lower[0], track.estimates[r].upper[0]) for r in track.rows]
     distance = 100.0 * np.abs(np.array(ends) - track.truth[track.rows, :1])
     bounded = distance[np.isfinite(distance)]
@@ -100,9 +100,9 @@ def _draw_plane_about_truth(axes: Axes, track: Track, reach: float) -> None:
 
 
 def tube(tracks: Mapping[str, Track]) -> Figure:
-    """Draw the boxes of x, y and z around the flight for each noise, all in one scale.
+    """Draw the boxes of x, y and z around the flight for each noise, all at the same scale.
 
-    Boxes too small to see are enlarged by one factor for all, which the title states.
+    Boxes too small to see are enlarged by a common factor, which the title states.
     """
     rows = -(-len(tracks) // _COLUMNS)
     figure = _figure(4.2 * min(_COLUMNS, len(tracks)), 4.4 * rows)
@@ -135,7 +135,7 @@ def tube(tracks: Mapping[str, Track]) -> Figure:
 def curves(
     x_label: str, x: Sequence[object], panels: Mapping[str, Mapping[str, Sequence[float]]]
 ) -> Figure:
-    """Draw panels of lines: panel -> line -> a value for each x; values of x evenly spaced."""
+    """Draw panels of lines: panel -> line -> a value for each x; x values are evenly spaced."""
     figure = _figure(3.6 * len(panels), 3.6)
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for panel, (name, lines) in zip(axes, panels.items(), strict=True):

@@ -1,4 +1,4 @@
-"""Time of a frame, from array to interval, of bundles that take turns."""
+"""Time per frame, from array to interval, of interleaved bundles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cvo_export.evaluate import subset_indices
 from cvo_export.files import read_json, write_json
 
 _WARM_UP_ROUNDS, _ROUNDS = 15, 200
-# Different frames of the timing pass, kept in memory.
+# Number of distinct frames in a timing pass, kept in memory.
 _TIMED_FRAMES = 20
 
 
@@ -32,10 +32,10 @@ class Timing(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def timed(path: Path, bundles: Mapping[str, tuple[str, Path]], dataset: PoseDataset) -> Timing:
-    """Return milliseconds a frame of bundles (digest, folder) by name.
+    """Return milliseconds per frame of bundles (digest, folder) by name.
 
-    Those kept at ``path`` if they are of these bundles; otherwise measured on test frames and
-    written there.
+    Uses the results at ``path`` if they belong to these bundles; otherwise measures on test frames
+    and writes them there.
     """
     digests = {name: digest for name, (digest, _) in bundles.items()}
     if path.is_file():
@@ -50,7 +50,7 @@ def timed(path: Path, bundles: Mapping[str, tuple[str, Path]], dataset: PoseData
 
 
 def frame_ms(bundles: Mapping[str, Path], dataset: PoseDataset) -> dict[str, dict[str, float]]:
-    """Time bundles in turns, one frame each: a change of the machine's speed affects all."""
+    """Time bundles alternately, one frame each, so that changes of clock speed affect all."""
     with ExitStack() as stack:
         odometers = {
             name: stack.enter_context(Odometer.load(folder)) for name, folder in bundles.items()
@@ -61,7 +61,7 @@ def frame_ms(bundles: Mapping[str, Path], dataset: PoseDataset) -> dict[str, dic
         spent: dict[str, list[float]] = {name: [] for name in names}
         for number in range(_WARM_UP_ROUNDS + _ROUNDS):
             image = images[number % len(images)]
-            # Each bundle is first, and follows each other one, equally often.
+            # Each bundle comes first, and follows each other bundle, equally often.
             shift = number % len(names)
             for name in names[shift:] + names[:shift]:
                 begin = perf_counter()

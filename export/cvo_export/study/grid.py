@@ -1,8 +1,7 @@
-"""A study: grids of methods, backbones, data, noise, options and seeds; every cell once.
+"""A study: grids of methods, backbones, data, noise, options and seeds; every cell runs once.
 
-The configuration is TOML, a list of grids; see ``Grid``. A cell that two grids share is run once.
-All cells are kept in one folder: an interrupted study resumes, and an extended one runs only its
-new cells.
+The configuration is a TOML list of grids; see ``Grid``. A cell that two grids share runs once. One
+folder stores all cells: an interrupted study resumes, and an extended one runs only its new cells.
 """
 
 from __future__ import annotations
@@ -40,30 +39,30 @@ from cvo_export.training.run import TrainConfig
 RESULTS_FILE = "results.json"
 
 Value = str | int | float
-# Options of the backbone and of the data; all others are the method's own.
+# Options of the backbone and of the data; all others belong to the method.
 _OF_THE_NETWORK = ("stages", "grid", "share")
 
 
 class Grid(Struct, frozen=True, forbid_unknown_fields=True):
-    """All combinations of its lists.
+    """All combinations of the values in its lists.
 
     Attributes
     ----------
     name
         Title of the grid in the report.
     data
-        ``FORMAT:PATH`` each; ``$NAME`` and ``${NAME}`` are variables of the environment.
+        Each ``FORMAT:PATH``; ``$NAME`` and ``${NAME}`` are environment variables.
     split
-        One for all data; by default ``sequence`` for data of five or more sequences, else
+        Split of all data sets; default: ``sequence`` for data of five or more sequences, otherwise
         ``block``.
     methods, backbones
         Names.
     weights
         ``timm``, ``none`` or a file, as for ``train``; variables as in ``data``.
     seeds
-        Number of seeds, from 0 on.
+        Number of seeds, starting at 0.
     noises
-        ``NAME`` or ``NAME:STRENGTH`` each; every cell is also evaluated on test frames with each.
+        Each ``NAME`` or ``NAME:STRENGTH``; every cell is also evaluated with each of them.
     vary
         Option -> its values: ``stages``, ``grid``, ``share`` (of the training frames) or an option
         of the methods.
@@ -91,16 +90,16 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Study(Struct, frozen=True, forbid_unknown_fields=True):
-    """A configuration file."""
+    """The content of a configuration file."""
 
     title: str
     grids: Annotated[list[Grid], Meta(min_length=1)]
 
 
 class Place(Struct, frozen=True, forbid_unknown_fields=True):
-    """Where a cell stands in a grid.
+    """A cell's position in a grid.
 
-    ``data`` is a key of ``Results.data``; ``varied`` holds the values of the options that vary.
+    ``data`` is a key of ``Results.data``; ``varied`` holds the values of the varied options.
     """
 
     grid: str
@@ -116,9 +115,10 @@ class Place(Struct, frozen=True, forbid_unknown_fields=True):
 class Results(Struct, frozen=True, forbid_unknown_fields=True):
     """Content of ``results.json``; its only paths are those written in the configuration.
 
-    Seconds and milliseconds depend on the machine; all other figures do not. ``data``: label of
-    each data set -> its text in the configuration; where two have the same name, their labels
-    include that text. ``timing`` by name of the grid, on its first data set; milliseconds by cell.
+    Seconds and milliseconds depend on the machine; all other figures do not. ``data`` maps the
+    label of each data set to its text in the configuration; labels of data sets with the same name
+    include that text. ``timing`` maps the name of a grid to milliseconds per cell, on its first
+    data set.
     """
 
     title: str
@@ -132,9 +132,9 @@ class Results(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Plan(Struct):
-    """The cells of a study by name: their configurations and the noises each is evaluated with.
+    """The cells of a study by name: their configurations and the noises of their evaluation.
 
-    ``data`` are the opened data sets and ``labels`` their labels, both by text.
+    ``data`` holds the opened data sets and ``labels`` their labels, both by text.
     """
 
     data: dict[str, PoseDataset]
@@ -145,14 +145,14 @@ class Plan(Struct):
 
 
 def read_study(path: Path) -> Study:
-    """Read a configuration; raises UsageError where it is not valid."""
+    """Read a configuration; raises UsageError if it is invalid."""
     try:
         return msgspec.convert(tomllib.loads(path.read_text("utf-8-sig")), Study)
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        # The encoding, the TOML, or the content is wrong.
-        raise UsageError(f"{path}: expected a study, found {error}") from None
+        # Invalid encoding, TOML or content.
+        raise UsageError(f"{path}: not a valid study: {error}") from None
 
 
 def run_study(
@@ -160,8 +160,8 @@ def run_study(
 ) -> Results:
     """Run the missing cells, time the bundles, and write ``results.json``.
 
-    Before anything is run, raises UsageError for an invalid grid, and for finished cells of other
-    data or weights; afterwards, raises what ``CellFolder.fill`` does.
+    Before any run, raises UsageError for an invalid grid and for finished cells with other data or
+    weights; afterwards, raises what ``CellFolder.fill`` raises.
     """
     plan = plan_study(study)
     for dataset in plan.data.values():
@@ -186,7 +186,7 @@ def run_study(
 
 
 def expanded(text: str) -> str:
-    """Replace variables of the environment; raises UsageError where one is not set."""
+    """Replace environment variables; raises UsageError if one is not set."""
     found = os.path.expandvars(text)
     if (unset := re.search(r"\$\{?(\w+)", found)) is not None:
         raise UsageError(f"{text}: the environment variable {unset[1]} is not set")
@@ -200,7 +200,7 @@ def plan_study(study: Study) -> Plan:
     names = [_file_safe(grid.name).lower() for grid in study.grids]
     if len(set(names)) < len(names):
         raise UsageError(
-            "study: expected names of grids that differ in their letters and digits, found "
+            "study: grid names must differ in their letters and digits, found "
             + ", ".join(grid.name for grid in study.grids)
         )
     for grid in study.grids:
@@ -242,11 +242,11 @@ def _add(plan: Plan, grid: Grid) -> None:
 
 
 def _check_networks(configs: Iterable[TrainConfig]) -> None:
-    """Raise UsageError for a backbone that cannot be built, or that its weights do not fit."""
+    """Raise UsageError if a backbone cannot be built or does not fit its weights."""
     distinct = {
         msgspec.json.encode((c.backbone, c.height, c.width, c.weights)): c
         for c in configs
-        # These would have to be downloaded.
+        # Weights from timm would have to be downloaded.
         if c.weights != TIMM_WEIGHTS
     }
     for config in distinct.values():
@@ -299,7 +299,7 @@ def _config(
 
 
 def _cell_name(config: TrainConfig, data: str, weights: str, dataset_name: str) -> str:
-    """Name of a cell, the same wherever its data and weights are."""
+    """Return the name of a cell, which does not depend on the paths of its data and weights."""
     decisive = {**msgspec.to_builtins(config), "dataset": data, "weights": weights}
     digest = hashlib.sha256(msgspec.json.encode(decisive)).hexdigest()[:8]
     words = (dataset_name, config.split, config.backbone.name, config.method, str(config.seed))
@@ -312,7 +312,7 @@ def _timing(
     cells: Mapping[str, Cell],
     folder: CellFolder,
 ) -> Timing:
-    """Time the bundles of seed 0 of a grid on its first data set."""
+    """Time a grid's bundles of seed 0 on its first data set."""
     first = (grid.name, plan.labels[grid.data[0]], 0)
     names = [p.cell for p in plan.places if (p.grid, p.data, p.seed) == first]
     bundles = {name: (cells[name].bundle, folder.bundle(name)) for name in names}

@@ -1,6 +1,6 @@
-"""Tasks on a Ray cluster: ``workers.run_tasks`` on all its machines.
+"""Tasks on a Ray cluster: ``workers.run_tasks`` across machines.
 
-All machines need the same packages, and must see the folders of the study under the same paths.
+All machines need the same packages and the study's folders at the same paths.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import Any
 from cvo_edge.errors import CvoError, UsageError
 from cvo_export.study.workers import Ended, Engine, Task, TaskError, attempt
 
-# How often a task is retried, from its checkpoints, after its process or machine has died.
+# Retries of a task, from its checkpoints, after its process or machine has died.
 _RETRIES = 3
 
 
-# Ray itself takes minutes to notice that nobody listens at an address.
+# Ray takes minutes to notice that nothing listens at an address.
 _SECONDS_TO_CONNECT = 5.0
 
 
@@ -30,10 +30,9 @@ _SECONDS_TO_CONNECT = 5.0
 def ray_engine() -> Iterator[Engine]:
     """Join the cluster that ``RAY_ADDRESS`` names or that was started on this machine.
 
-    Yields a function that runs tasks by name, one on each core; the others continue after a
-    failure.
+    Yields a function that runs tasks by name, one per core; the others continue after a failure.
 
-    Raises UsageError where ray is not installed or no cluster is found.
+    Raises UsageError if ray is not installed or no cluster is found.
     """
     _take_the_heads_side()
     try:
@@ -48,9 +47,9 @@ def ray_engine() -> Iterator[Engine]:
         )
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        # Tasks report for themselves.
+        # Tasks print their own progress.
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-        # Ray replaces them by its own, with another exit code.
+        # Ray replaces the signal handlers by its own, which use another exit code.
         for number, handler in handlers.items():
             signal.signal(number, handler)
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -63,7 +62,7 @@ def ray_engine() -> Iterator[Engine]:
 
 
 def _take_the_heads_side() -> None:
-    """Use a token where ``ray start`` does: where the user has one, unless told otherwise.
+    """Use token authentication whenever ``ray start`` does: if the user has a token, by default.
 
     Ray reads the variable when it is imported.
     """
@@ -74,7 +73,7 @@ def _take_the_heads_side() -> None:
 
 
 def _address() -> str | None:
-    """HOST:PORT of a cluster: from the environment, else that of this machine's last head."""
+    """HOST:PORT of a cluster: from the environment, otherwise of this machine's last head."""
     named = os.environ.get("RAY_ADDRESS", "auto")
     if named != "auto":
         return named
@@ -110,7 +109,7 @@ def _on_a_worker(task: Task, folder: Path) -> CvoError | None:
     import torch
 
     torch.set_num_threads(1)
-    # Relative paths of data and weights mean the same here as where the study was started.
+    # Resolve relative paths of data and weights as in the process that started the study.
     with suppress(OSError):
         os.chdir(folder)
     return attempt(task)

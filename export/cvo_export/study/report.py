@@ -1,4 +1,4 @@
-"""The report of a study: one self-contained HTML page, and its pictures as files."""
+"""The report of a study: one self-contained HTML page, and its figures as files."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _DPI = 110
 
 
 class Picture(NamedTuple):
-    """A picture of the report, and what it shows; ``source`` is the file as a data URL."""
+    """A picture of the report and its caption; ``source`` is the file as a data URL."""
 
     caption: str
     source: str
 
 
 class Section(NamedTuple):
-    """A grid of the report."""
+    """The report's section on one grid."""
 
     title: str
     text: str
@@ -50,7 +50,7 @@ class Section(NamedTuple):
 
 
 def page_template() -> Template:
-    """Return the template of the page; raises UsageError where a package for it is missing."""
+    """Return the template of the page; raises UsageError if a required package is missing."""
     try:
         import matplotlib  # noqa: F401
         from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -65,9 +65,9 @@ def page_template() -> Template:
 
 
 def write_report(results: Results, folder: CellFolder, template: Template) -> Path:
-    """Write ``report.html`` and the pictures; returns the page.
+    """Write ``report.html`` and the pictures; returns the path of the page.
 
-    Raises SinkError where a file cannot be written.
+    Raises SinkError if a file cannot be written.
     """
     report = _Report(results, folder)
     page = template.render(
@@ -91,7 +91,7 @@ def write_report(results: Results, folder: CellFolder, template: Template) -> Pa
 
 
 class _Report:
-    """Sections and pictures of the grids of a study."""
+    """Sections and pictures of a study's grids."""
 
     def __init__(self, results: Results, folder: CellFolder) -> None:
         self.results = results
@@ -119,7 +119,7 @@ class _Report:
         return Section(grid.name, f"{seeds}; weights {_source(grid.weights)}", tables, pictures)
 
     def sets(self, grid: Grid) -> list[Picture]:
-        """Return the sets of all methods, and one method's tube under each noise, seed 0."""
+        """Return pictures of all methods' sets, and of a method's tube under each noise, seed 0."""
         from cvo_export.plot import track
         from cvo_export.study.figures import comparison, tube
 
@@ -157,7 +157,7 @@ class _Report:
         return pictures
 
     def curves(self, grid: Grid, title: str, places: Sequence[Place]) -> Picture:
-        """Return one picture: the first varied option along x, a line for each other setting."""
+        """Return a picture with the first varied option along x and a line per other setting."""
         from cvo_export.study.figures import curves
 
         option = next(iter(grid.vary))
@@ -202,7 +202,7 @@ class _Report:
         }
 
     def picture(self, name: str, figure: Figure, caption: str) -> Picture:
-        """Write a picture as a file, and return it for the page."""
+        """Write a picture to a file, and return it for the page."""
         stream = BytesIO()
         figure.savefig(stream, format="png", dpi=_DPI)
         content = stream.getvalue()
@@ -211,14 +211,14 @@ class _Report:
         return Picture(caption, "data:image/png;base64," + base64.b64encode(content).decode())
 
     def dataset(self, label: str) -> PoseDataset:
-        """Return the data set of this label, opened once."""
+        """Return the data set with this label; opens it once."""
         if label not in self._opened:
             self._opened[label] = open_dataset(expanded(self.results.data[label]))
         return self._opened[label]
 
 
 def tube_method(tracks: Mapping[str, Track]) -> str:
-    """Return the method whose tube is drawn: the first whose sets are bounded in every frame."""
+    """Return the method whose tube is drawn: the first with bounded sets in every frame."""
 
     def bounded(track: Track) -> bool:
         estimates = [track.estimates[row] for row in track.rows]
@@ -228,12 +228,12 @@ def tube_method(tracks: Mapping[str, Track]) -> str:
 
 
 def _sequence_shown(place: Place, dataset: PoseDataset) -> str:
-    """Name of the sequence that has the most test frames."""
+    """Return the name of the sequence with the most test frames."""
     test = make_split(dataset, place.split, place.seed).roles["test"]
     name: str = dataset.sequence_names[int(np.bincount(dataset.sequence[test]).argmax())]
     return name
 
 
 def _source(weights: str) -> str:
-    """Weights as a reader may know them: without a path."""
-    return weights if weights in ("timm", "none") else "of a file"
+    """Describe the weights without their path."""
+    return weights if weights in ("timm", "none") else "from a file"

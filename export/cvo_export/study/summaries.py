@@ -1,4 +1,4 @@
-"""Figures of a method's cells as text: medians over the seeds, for every table."""
+"""Figures of a method's cells as text: medians over the seeds, for all tables."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 from cvo_export.study.cell import Cell, Figures
 
-# Stands for a figure that a cell does not have.
+# Shown for a figure that a cell does not have.
 BLANK = "-"
 
 
 def sets_shown(figures: Sequence[Figures]) -> tuple[str, str, str, str]:
-    """Coverage, coverage of all six, mean width, and score with that of each seed."""
+    """Coverage, coverage of all six, mean width, and score, with the score of each seed."""
     scores = [entry.normalised_interval_score for entry in figures]
     each = f" ({', '.join(f'{score:.3f}' for score in scores)})" if len(scores) > 1 else ""
     return (
@@ -26,13 +26,13 @@ def sets_shown(figures: Sequence[Figures]) -> tuple[str, str, str, str]:
 
 
 def own_shown(cells: Sequence[Cell]) -> tuple[str, str, str, str] | None:
-    """As ``sets_shown``, of the networks' own bounds; None where they have none."""
+    """See ``sets_shown``; uses the networks' own bounds, None if they have none."""
     own = [cell.own for cell in cells if cell.own is not None]
     return sets_shown(own) if own else None
 
 
 def joint_shown(cells: Sequence[Cell]) -> tuple[str, str]:
-    """Coverage of the joint sets, and the edge of a box of their volume, in deviations."""
+    """Coverage of the joint sets, and the edge of a cube of their volume, in deviations."""
     volume = median(cell.joint_volume["geometric_mean"] for cell in cells)
     coverage = median(cell.joint.joint_coverage for cell in cells)
     return f"{coverage:.3f}", f"{volume ** (1 / 6):.3f}"
@@ -60,12 +60,12 @@ def pieces_shown(cells: Sequence[Cell]) -> str:
 
 
 def seconds_shown(cells: Sequence[Cell]) -> str:
-    """Processor seconds of training, of the cells whose time is known."""
+    """Processor seconds of training, over the cells whose time is known."""
     found = [cell.training.processor for cell in cells if cell.training is not None]
     return f"{median(found):.0f}" if found else BLANK
 
 
 def median(values: Iterable[float]) -> float:
-    """Median; NaN without values."""
+    """Median; NaN if there are no values."""
     found = list(values)
     return float(np.median(found)) if found else float("nan")

@@ -48,11 +48,11 @@ class Tables:
         return [place for place in self.results.places if place.grid == grid.name]
 
     def cell(self, place: Place) -> Cell:
-        """Return the figures of a place."""
+        """Return the figures at a place."""
         return self.results.cells[place.cell]
 
     def figures_table(self, title: str, places: Sequence[Place], varied: Sequence[str]) -> Table:
-        """Return a line for each backbone, method and value of the options that vary."""
+        """Return a row for each backbone, method and value of the varied options."""
         head = [
             *("backbone", "method", *varied),
             *("coverage", "all six", "mean width", "score", "joint scope: all six", "volume^1/6"),
@@ -80,7 +80,7 @@ class Tables:
         return Table(title, head, rows)
 
     def coverage_table(self, title: str, places: Sequence[Place]) -> Table:
-        """Return a line for each run: coverage of each degree of freedom, and its 99 % band.
+        """Return a row for each run: coverage of each degree of freedom, and its 99 % band.
 
         Only the frames of a random split are exchangeable; other splits have no band.
         """
@@ -106,7 +106,7 @@ class Tables:
         return Table(f"{title}: each run", head, rows)
 
     def noise_table(self, title: str, places: Sequence[Place], grid: Grid) -> Table:
-        """Return a line for each backbone, method, varied value and noise: both thresholds."""
+        """Return a row for each backbone, method, varied value and noise, with both thresholds."""
         head = [
             *("backbone", "method", *grid.vary, "noise", "invalid", "point error"),
             *("thresholds of clean frames: coverage", "all six", "mean width", "score"),
@@ -136,7 +136,7 @@ class Tables:
         return Table(f"{title}, with noise", head, rows)
 
     def table_one(self, grid: Grid) -> Table:
-        """Return the paper's Table I with numbers, for a grid's first data set and backbone."""
+        """Return the paper's Table I as numbers, for a grid's first data set and backbone."""
         first = self.places(grid)[0]
         places = [
             place
@@ -167,7 +167,7 @@ class Tables:
                     *(self.joint_sets(found[0]) for found in columns.values()),
                 ],
                 row("disjoint bands: share of sets in pieces", pieces_shown),
-                ["complexity: ms a frame", *map(self.milliseconds, columns.values())],
+                ["complexity: ms per frame", *map(self.milliseconds, columns.values())],
                 row("complexity: millions of parameters", _millions),
                 row("complexity: MiB of the model", _mebibytes),
                 *rows_of(
@@ -197,16 +197,16 @@ class Tables:
         )
 
     def joint_sets(self, place: Place) -> str:
-        """Return what the joint scope of a place's bundle is made of."""
+        """Describe the joint sets of a place's bundle."""
         return HEADS[read_calibration(self.folder.bundle(place.cell)).method].set_kind
 
     def by_option(
         self, grid: Grid, first: Place, option: str, figure: Callable[[Cell], float | None]
     ) -> dict[float, dict[str, str]]:
-        """Value of an option -> method -> a figure, median over seeds.
+        """Map value of an option -> method -> a figure, median over seeds.
 
-        All else is as in a grid's first place. Other options that vary with this one are at the
-        method's default.
+        Everything else is as in a grid's first place. Options that vary together with this one have
+        the method's default.
         """
         groups: dict[tuple[str, Value], list[Place]] = {}
         for other in self.results.study.grids:
@@ -225,7 +225,7 @@ class Tables:
         return dict(sorted(found.items()))
 
     def milliseconds(self, places: Sequence[Place]) -> str:
-        """Median time of a frame, for the cell that was timed."""
+        """Median time per frame of the timed cell."""
         timings = [timing.ms for timing in self.results.timing.values()]
         found = [ms[place.cell]["p50"] for place in places for ms in timings if place.cell in ms]
         return f"{found[0]:.2f}" if found else BLANK
@@ -234,7 +234,7 @@ class Tables:
 def grouped(
     places: Iterable[Place], key: Callable[[Place], tuple[Any, ...]]
 ) -> list[tuple[tuple[Any, ...], list[Place]]]:
-    """Places by their keys, in the order of their first ones."""
+    """Group places by key, in the order of first occurrence."""
     groups: dict[tuple[Any, ...], list[Place]] = {}
     for place in places:
         groups.setdefault(key(place), []).append(place)
@@ -242,7 +242,7 @@ def grouped(
 
 
 def noise_names(grid: Grid) -> list[str]:
-    """Noises of a grid, by the names that cells list them under."""
+    """Return a grid's noises under the names that cells use."""
     return list(dict.fromkeys(str(parse_noise(text)) for text in grid.noises))
 
 
@@ -251,13 +251,13 @@ def _setting_of(place: Place) -> tuple[Any, ...]:
 
 
 def _setting(grid: Grid) -> tuple[str, ...]:
-    """What two grids must share for their cells to differ only in what varies."""
+    """Return what two grids must share for their cells to differ only in the varied options."""
     training = (grid.copies, grid.steps, grid.fine_tune)
     return (grid.weights, grid.size, grid.stages, grid.grid, *map(str, training))
 
 
 def _by_default(place: Place, option: str) -> bool:
-    """Whether every varied option but this one is at the method's default."""
+    """Whether every varied option but this one has the method's default."""
     known = TRAINABLE[place.method].config()
     return all(
         getattr(known, name, None) == value
@@ -275,6 +275,6 @@ def _mebibytes(cells: Sequence[Cell]) -> str:
 
 
 def _share_invalid(cells: Sequence[Cell], invalid: Sequence[int]) -> str:
-    """Median share of the test frames that did not pass the checks."""
+    """Median share of test frames that did not pass the checks."""
     totals = [cell.frames["total"] for cell in cells]
     return f"{100 * median(np.divide(invalid, totals).tolist()):.1f} %"

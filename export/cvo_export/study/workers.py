@@ -1,4 +1,4 @@
-"""Parallel tasks, each in a process of its own with one thread of torch."""
+"""Parallel tasks, each in its own process with one torch thread."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from multiprocessing.context import SpawnProcess
 from cvo_edge.errors import CvoError, SinkError
 
 Task = Callable[[], None]
-# Called with the name of a task that has ended, and its error if it failed.
+# Receives the name of a finished task, and its error if it failed.
 Ended = Callable[[str, CvoError | None], None]
 # Runs every task once.
 Engine = Callable[[Mapping[str, Task], Ended], None]
 
 
-# A process unwinds only after a pending call into a library has returned.
+# A process unwinds only after a pending library call has returned.
 _SECONDS_TO_LEAVE = 10.0
 
 
@@ -31,8 +31,8 @@ class TaskError(CvoError):
 def run_tasks(jobs: int, tasks: Mapping[str, Task], ended: Ended) -> None:
     """Run tasks by name, ``jobs`` at a time; the others continue after a failure.
 
-    With one job, tasks run in this process. With several, they are sent to other processes and must
-    pickle. No process outlives this call.
+    With one job, tasks run in this process. With several, they run in other processes and must be
+    picklable. No process outlives this call.
     """
     if jobs > 1:
         _in_processes(tasks, jobs, ended)
@@ -54,7 +54,7 @@ def _in_processes(tasks: Mapping[str, Task], jobs: int, ended: Ended) -> None:
                 with _interrupts_ignored():
                     process.start()
                 running[receiver] = (name, process)
-                # Only the process holds its end now, so that its death closes the pipe.
+                # Only the process holds the sending end now, so that its death closes the pipe.
                 sender.close()
             ready = wait(list(running))
             for receiver in [receiver for receiver in running if receiver in ready]:
@@ -83,7 +83,7 @@ def _outcome(receiver: Connection, process: SpawnProcess) -> CvoError | None:
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Let processes started here ignore SIGINT; their parent ends them."""
+    """Make processes started here ignore SIGINT; their parent terminates them."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
@@ -108,7 +108,7 @@ def attempt(task: Task) -> CvoError | None:
         return error
     except OSError as error:
         return SinkError(f"{error.filename or 'output'}: {error.strerror}")
-    except Exception as error:  # noqa: BLE001 - the other tasks go on
+    except Exception as error:  # noqa: BLE001 - the other tasks continue
         traceback.print_exc()
         return TaskError(" ".join(f"{type(error).__name__}: {error}".split()))
     return None

@@ -1,1 +1,1 @@
-"""Training: configuration, features, the loop and its run folder."""
+"""Training: configuration, features, the training loop and its run folder."""

@@ -1,4 +1,4 @@
-"""Options of the command line -> a ``TrainConfig``, with the values that depend on the data."""
+"""Convert command-line options to a ``TrainConfig`` and fill in data-dependent defaults."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def configure(
 ) -> TrainConfig:
     """Fill in the defaults; ``given`` are TrainConfig's numbers, ``head`` the method's options.
 
-    None stands for the default of each. Raises UsageError for a text of another form and for an
-    option that the method does not have; the data set is opened only after all of these checks.
+    None stands for the default. Raises UsageError for a malformed value or an option that the
+    method does not have; these checks run before the data set is opened.
     """
     chosen = head_config(method, head)
     width, height = _pair(size, "size", "WIDTHxHEIGHT")
@@ -69,10 +69,10 @@ def configure(
 
 
 def head_config(method: str, options: dict[str, Any]) -> Struct:
-    """Return a method's options, checked; None stands for the default of each.
+    """Return a method's checked options; None stands for the default.
 
-    Raises UsageError for an unknown method, an option that the method does not have, and a value
-    out of its range.
+    Raises UsageError for an unknown method, an option that the method does not have, or a value out
+    of range.
     """
     if method not in TRAINABLE:
         raise UsageError(f"method: expected one of {', '.join(TRAINABLE)}, found {method}")
@@ -93,7 +93,7 @@ def head_config(method: str, options: dict[str, Any]) -> Struct:
 
 
 def _refusal(problem: str, method: str, given: dict[str, Any]) -> str:
-    """Name the option, and what was given, in the message of a field that is out of range."""
+    """Name the option and its value in the message about a field that is out of range."""
     found = re.fullmatch(r"E(.*) - at `\$\.(\w+)(?:\[\d+\])?`", problem)
     if found is None:
         return problem

@@ -1,7 +1,7 @@
-"""What the heads are trained on: cached features of augmented copies, or fresh images.
+"""Training inputs of the heads: cached features of augmented copies, or fresh images.
 
-The frozen network's features are computed by its own exported graph through the runtime: several
-times faster than torch on a CPU, and exactly what the device will compute.
+Features of a frozen network come from its exported graph, run by the runtime: on a CPU this is
+several times faster than torch, and it yields exactly what the device computes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Image = NDArray[np.uint8]
 
 
 class ModelImages:
-    """Frames of a data set as the model sees them: (height, width, 3) uint8 RGB, kept in memory."""
+    """Frames of a data set as model inputs: (height, width, 3) uint8 RGB, kept in memory."""
 
     def __init__(
         self,
@@ -65,14 +65,14 @@ class ModelImages:
     def augmented(
         self, row: int, config: AugmentConfig, generator: np.random.Generator
     ) -> tuple[Image, Array]:
-        """Return a changed copy of one image and its exact pose (7,)."""
+        """Return an augmented copy of one image and its exact pose (7,)."""
         return augmented(self.images[row], self.poses[row], self.K, config, generator)
 
 
 class FeatureExtractor:
     """Images (height, width, 3) uint8 RGB -> features (size,), by the exported backbone.
 
-    Exported when the first image comes: where all features are at hand, none does.
+    The first image triggers the export: a run whose features are all cached does without it.
     """
 
     def __init__(self, backbone: Backbone, height: int, width: int) -> None:
@@ -86,7 +86,7 @@ class FeatureExtractor:
         with self._exporting:
             if self._session is None:
                 content = export_onnx(self._backbone, [self._blank], ["image"], ["features"])
-                # One thread each: several images at a time need no waiting for one another.
+                # One thread per session: images are processed in parallel.
                 self._session = Session(content, threads=1)
         return np.asarray(self._session.run({"image": image[np.newaxis]})["features"][0])
 
@@ -94,7 +94,7 @@ class FeatureExtractor:
 def cached_features(
     folder: Path, images: ModelImages, extractor: FeatureExtractor
 ) -> NDArray[np.float32]:
-    """Features (n, size) of images as they are, kept in a file named for their pixels."""
+    """Features (n, size) of the unaugmented images, cached in a file named after their pixels."""
     path = folder / f"frames-{images.digest()[:24]}.npz"
     found = _stored(path, len(images))
     if found is None:
@@ -112,9 +112,10 @@ def cached_copies(
     seed: int,
     progress: Progress,
 ) -> tuple[NDArray[np.float16], Array]:
-    """Features (copies + 1, n, size) and poses (copies + 1, n, 7); the first is unchanged.
+    """Features (copies + 1, n, size) and poses (copies + 1, n, 7); copy 0 is not augmented.
 
-    One file a copy, written whole or not at all, so that an interrupted run goes on with the next.
+    Each copy is a file of its own, written atomically, so that an interrupted run resumes with
+    the next copy.
     """
     features, poses = [], []
     for number in range(copies + 1):
@@ -131,7 +132,7 @@ def cached_copies(
 
 
 def _stored(path: Path, count: int) -> dict[str, NDArray[Any]] | None:
-    """Arrays of ``count`` rows each, or None where there are none, or no whole ones."""
+    """Return arrays of ``count`` rows each, or None if the file is missing or incomplete."""
     try:
         with np.load(path) as stored:
             arrays = dict(stored)
@@ -141,7 +142,7 @@ def _stored(path: Path, count: int) -> dict[str, NDArray[Any]] | None:
 
 
 def _store(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """Write whole or not at all: another run may be writing the same file."""
+    """Write atomically: another run may be writing the same file."""
     with whole_file(path, make_folder=True) as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
 
@@ -150,11 +151,11 @@ def _one_copy(
     images: ModelImages, extractor: FeatureExtractor, config: AugmentConfig, seed: tuple[int, int]
 ) -> dict[str, NDArray[Any]]:
     def one(row: int) -> tuple[NDArray[np.float16], Array]:
-        # A generator of its own for each image: the result does not depend on the order.
+        # A generator per image makes the result independent of the processing order.
         image, pose = images.augmented(row, config, np.random.default_rng((*seed, row)))
         return extractor(image).astype(np.float16), pose
 
-    # OpenCV and onnxruntime let other threads run, so whole images are the unit of work.
+    # OpenCV and onnxruntime release the GIL, so threads can process whole images.
     with ThreadPoolExecutor(max_workers=allowed_cores()) as pool:
         found = list(pool.map(one, range(len(images))))
     return {

@@ -26,16 +26,16 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Batch = Callable[[np.random.Generator], tuple[Tensor, Tensor]]
 
-# Evaluations on val in a phase, and how many without a new best end it. The learning rate falls as
-# a cosine, so most of the gain comes late: patience is long.
+# Evaluations on val per phase, and evaluations without a new best that end it. The learning rate
+# follows a cosine, so most of the gain comes late: the patience is high.
 _EVALUATIONS = 40
 _PATIENCE = 20
-# An image costs the backbone a hundred times what its features cost the head.
+# An image costs the backbone a hundred times as much as its features cost the head.
 _IMAGE_BATCH = 16
 
 
 class Lesson:
-    """The phases of a lesson: the head on cached features; with fine-tuning all, then it again."""
+    """The phases of a lesson: the head; with fine-tuning also backbone and head, then the head."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Lesson:
         self._path = material.run_dir / f"checkpoint-{name}.pt"
 
     def fit(self) -> list[History]:
-        """Run all phases, from the checkpoint if there is one; returns the history."""
+        """Run all phases, from the checkpoint if it exists; returns the history."""
         checkpoint = self._read_checkpoint()
         first = checkpoint["phase"] if checkpoint else 0
         phases = 3 if self.config.fine_tune and self._examples is None else 1
@@ -72,7 +72,7 @@ class Lesson:
         return self.history
 
     def _fit_head(self, phase: int, state: dict[str, Any] | None) -> None:
-        """Train the head on features of augmented copies, computed by the present backbone."""
+        """Train the head on features of augmented copies, computed by the current backbone."""
         if state is not None and state["ended"]:
             self._keep(phase, state["best"])
             return
@@ -95,7 +95,7 @@ class Lesson:
     def _fit_all(self, phase: int, state: dict[str, Any] | None) -> None:
         """Train backbone and head together on fresh augmented images."""
         images, val_images = self.material.images, self.material.val_images
-        # Batch statistics of 16 images are too noisy: the running ones stay.
+        # Batch statistics of 16 images are too noisy: keep the running ones.
         self.material.backbone.eval()
 
         def batch(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -118,7 +118,7 @@ class Lesson:
             return torch.cat(features), self.material.val_y
 
         groups = [
-            # The head is trained already: a full rate would undo it.
+            # Reduce the rate: a full one would undo the training of the head.
             {"params": list(self.learner.parameters()), "peak": 0.3 * self.config.learning_rate},
             {
                 "params": list(self.material.backbone.parameters()),
@@ -138,7 +138,7 @@ class Lesson:
         val: Callable[[nn.Module], tuple[Tensor, Array]],
         state: dict[str, Any] | None,
     ) -> None:
-        """Run one phase; what learns ends with the averaged weights that were best on val."""
+        """Run one phase; it ends by loading the averaged weights that were best on val."""
         config = self.config
         optimiser = torch.optim.AdamW(groups, weight_decay=config.weight_decay)
         averaging = get_ema_multi_avg_fn(config.averaging)  # type: ignore[no-untyped-call]
@@ -185,7 +185,7 @@ class Lesson:
         self._keep(phase, best)
 
     def _learning(self, phase: int) -> nn.ModuleDict:
-        """What learns in a phase: averaging a frozen backbone would take as long as the head."""
+        """Modules a phase trains; averaging a frozen backbone would cost as much as the head."""
         return self.both if phase == 1 else nn.ModuleDict({"learner": self.learner})
 
     def _keep(self, phase: int, best: dict[str, Any]) -> None:
@@ -224,11 +224,11 @@ class Lesson:
             self._learning(state["phase"]).load_state_dict(state["best"]["weights"])
             self.both.load_state_dict(state["weights"])
             self.history = [History(*entry) for entry in state["history"]]
-        # What torch raises for another network's file, and History for another release's entries.
+        # torch fails on another network's file, History on another release's entries.
         except (RuntimeError, KeyError, TypeError, UnpicklingError, EOFError):
             raise UsageError(
                 f"{self._path}: expected a checkpoint of this version, found another file; remove "
-                "it to train anew"
+                "it to restart training"
             ) from None
         return state
 
@@ -239,7 +239,7 @@ def _cloned(module: nn.Module) -> dict[str, Tensor]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Keep torch to one thread: a batch of 64 rows is too little for two to share."""
+    """Limit torch to one thread: a batch of 64 rows is too small to split."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -249,7 +249,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def lesson_seed(seed: int, name: str) -> int:
-    """One seed a lesson, so that none depends on how much randomness those before it used."""
+    """Return a seed per lesson, so that no lesson depends on the random numbers of earlier ones."""
     return int(np.random.SeedSequence((seed, zlib.crc32(name.encode()))).generate_state(1)[0])
 
 

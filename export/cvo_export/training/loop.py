@@ -1,8 +1,8 @@
-"""One training loop: features, steps, early stopping on val, checkpoints.
+"""The training loop: features, steps, early stopping on val, checkpoints.
 
-A run is a series of lessons, most often one. Batches are a function of (seed, lesson, phase, step)
-and noise comes from a generator whose state is in the checkpoint: an interrupted run that goes on
-ends with the same numbers as one that never was.
+A run is a series of lessons, usually a single one. Batches are a function of (seed, lesson, phase,
+step), and noise comes from a generator whose state is in the checkpoint: a resumed run ends with
+the same numbers as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ Indices = NDArray[np.int64]
 Batch = Callable[[np.random.Generator], tuple[Tensor, Tensor]]
 
 
-# Fewer scores support no finite threshold at 0.9.
+# With fewer scores, the threshold at 0.9 is not finite.
 _LEAST_VAL = 9
 
 
 def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | None = None) -> Run:
-    """Train, or go on where an interrupted run of the same configuration stopped.
+    """Train, or resume an interrupted run of the same configuration.
 
-    Features of the pretrained network are kept in the run's folder, or in a folder of ``cache``
+    Features of the pretrained network are stored in the run's folder, or in a folder of ``cache``
     that all runs with the same frames, network and augmentation share.
 
-    Raises UsageError where ``run_dir`` holds another configuration, or where val has too few frames
-    to decide anything.
+    Raises UsageError if ``run_dir`` holds another configuration, or if val has too few frames to
+    select a network.
     """
     dataset, split = open_run(run_dir, config)
     _check_val(config, split)
@@ -64,7 +64,7 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
     images = ModelImages(dataset, indices, *size)
-    # Random weights are the run's own.
+    # Random weights differ between runs: do not share their features.
     features_folder = run_dir / f"{FEATURES_FOLDER}-0"
     if cache is not None and weights_sha256 is not None:
         features_folder = shared_folder(cache, config, weights_sha256, images)
@@ -90,22 +90,22 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
 
 
 def check_roles(config: TrainConfig, dataset: PoseDataset) -> None:
-    """Raise UsageError where a run's data set cannot be split, or val is too small to decide."""
+    """Raise UsageError if the data set cannot be split, or val is too small."""
     _check_val(config, make_split(dataset, config.split, config.seed))
 
 
 def _check_val(config: TrainConfig, split: Split) -> None:
     if split.roles["val"].size < _LEAST_VAL:
         raise UsageError(
-            f"{config.dataset}: expected at least {_LEAST_VAL} frames of the role val, which "
-            f"decides by intervals of 0.9, found {split.roles['val'].size}"
+            f"{config.dataset}: expected at least {_LEAST_VAL} frames of the role val for "
+            f"intervals at 0.9, found {split.roles['val'].size}"
         )
 
 
 def prepare_features(config: TrainConfig, cache: Path, progress: Progress) -> None:
-    """Compute the features that runs of this configuration share, so that each finds them.
+    """Compute the features that runs of this configuration share.
 
-    Features of random weights are a run's own: then nothing is done.
+    Does nothing for random weights, whose features are not shared.
     """
     dataset = open_dataset(config.dataset)
     split = make_split(dataset, config.split, config.seed)
@@ -133,7 +133,8 @@ def prepare_features(config: TrainConfig, cache: Path, progress: Progress) -> No
 class _Trainer:
     """The lessons of a run; see ``cvo_export.networks.heads.base.Lessons``.
 
-    A run that fine-tunes its backbone has one lesson on features: another would learn from others.
+    A run that fine-tunes its backbone can have only one lesson on features: a second lesson would
+    use features of a different backbone.
     """
 
     def __init__(
@@ -155,9 +156,11 @@ class _Trainer:
         examples: Examples | None = None,
         candidate: bool = True,
     ) -> L:
-        """Train what ``build`` makes, with random numbers of its own name."""
+        """Train the network made by ``build``; random numbers depend on ``name``."""
         if self.fine_tuned and self.history and examples is None:
-            raise UsageError(f"fine-tune: expected a method of one lesson, found another, {name}")
+            raise UsageError(
+                f"fine-tune: the method trains another network ({name}) on the features; use 0"
+            )
         torch.manual_seed(lesson_seed(self.setting.seed, name))
         learner = build()
         if rows is None:
@@ -171,12 +174,12 @@ class _Trainer:
         return self._material.images.poses
 
     def features(self) -> tuple[NDArray[np.float16], Array]:
-        """Features and poses of all copies of the training images, by the backbone as learnt."""
+        """Features and poses of all copies of the training images, from the trained backbone."""
         features, poses, _ = self._material.cached(self._last_phase)
         return features, poses
 
     def val(self) -> tuple[Tensor, Array]:
-        """Features and poses of val, by the backbone as learnt."""
+        """Features and poses of val, from the trained backbone."""
         return self._material.cached(self._last_phase)[2], self._material.val_images.poses
 
     @property

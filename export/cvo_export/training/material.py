@@ -1,4 +1,4 @@
-"""What all lessons of a run learn from: images, features and standardised poses."""
+"""Data shared by all lessons of a run: images, features and standardised poses."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FEATURES_FOLDER = "features"
 
 @dataclass
 class Material:
-    """What all lessons of a run learn from, and where they are kept."""
+    """Data shared by all lessons of a run, and the folders that cache it."""
 
     run_dir: Path
     features_folder: Path
@@ -48,14 +48,14 @@ class Material:
         self._cached: dict[int, tuple[NDArray[np.float16], Array, Tensor]] = {}
 
     def cached(self, phase: int) -> tuple[NDArray[np.float16], Array, Tensor]:
-        """Features and poses of all copies, features of val, by the backbone as it is in a phase.
+        """Features and poses of all copies, features of val, from the backbone of a phase.
 
         Shapes (copies + 1, n, size), (copies + 1, n, 7) and (n_val, size).
         """
         if phase not in self._cached:
             config, folder = self.config, self.features_folder
             if phase > 0:
-                # A backbone that has learnt is this run's alone.
+                # A fine-tuned backbone belongs to this run only.
                 folder = self.run_dir / f"{FEATURES_FOLDER}-{phase}"
             extractor = FeatureExtractor(self.backbone, config.height, config.width)
             val = cached_features(folder, self.val_images, extractor)
@@ -80,9 +80,9 @@ class Material:
 def shared_folder(
     cache: Path, config: TrainConfig, weights_sha256: str, images: ModelImages
 ) -> Path:
-    """Where the pretrained network's features of these images are kept in a shared cache.
+    """Return the shared cache's folder for the pretrained network's features of these images.
 
-    The name is a digest of everything that decides them.
+    Its name is a digest of everything that determines the features.
     """
     decisive = {
         "weights": weights_sha256,

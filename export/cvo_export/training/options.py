@@ -1,7 +1,7 @@
-"""The methods' options on the command line, made from the fields of their configuration structs.
+"""The methods' command-line options, generated from the fields of their configuration structs.
 
-A field's type, bounds and ``Meta(description=...)`` say all that the command line needs: a method
-that is registered in ``TRAINABLE`` has its options there without another line of code.
+A field's type, bounds and ``Meta(description=...)`` define its option, so that a method registered
+in ``TRAINABLE`` needs no further code here.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class _Field:
 
 
 def method_parameters(methods: Mapping[str, Method]) -> list[Parameter]:
-    """Return one keyword parameter for each option that a method has, None by default.
+    """Return a keyword parameter for each option of the methods; None by default.
 
-    An option of several methods is one parameter; its help names the methods and their defaults.
-    Raises TypeError where methods give one name to options of different types.
+    Methods that share an option share its parameter; its help names the methods and their defaults.
+    Raises TypeError if methods use one name for options of different types.
     """
     options: dict[str, list[_Field]] = {}
     for method, registered in methods.items():
@@ -47,7 +47,7 @@ def method_parameters(methods: Mapping[str, Method]) -> list[Parameter]:
 
 
 def option_name(field: str) -> str:
-    """Return the option of a field: ``latent_size`` -> ``--latent-size``."""
+    """Return the option name of a field: ``latent_size`` -> ``--latent-size``."""
     return "--" + field.replace("_", "-")
 
 
@@ -60,7 +60,7 @@ def _fields(method: str, registered: Method) -> Iterator[_Field]:
 
 
 def _unwrapped(kind: Any) -> tuple[Any, list[Meta]]:  # noqa: ANN401 - types of any kind
-    """Return a type without ``Annotated`` and ``None``, and what it was annotated with."""
+    """Strip ``Annotated`` and ``None`` from a type; also return its metadata."""
     if get_origin(kind) is Annotated:
         inner, *metas = get_args(kind)
         bare, more = _unwrapped(inner)
@@ -103,7 +103,7 @@ def _common_type(fields: list[_Field]) -> Any:  # noqa: ANN401 - types of any ki
 
 
 def _help(fields: list[_Field], n_methods: int) -> str:
-    """One sentence for each meaning, then each method's default where there is one."""
+    """Return a sentence for each meaning, followed by the methods' defaults."""
     if len(fields) == 1:
         notes = [fields[0].bounds]
         if fields[0].default is not None:

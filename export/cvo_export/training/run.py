@@ -1,4 +1,4 @@
-"""A training run: its options, its folder, and what it learned."""
+"""A training run: its options, its folder and its result."""
 
 from __future__ import annotations
 
@@ -29,31 +29,31 @@ NETWORK_FILE = "network.pt"
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides a run; written to ``config.json``.
+    """All options that determine a run; stored in ``config.json``.
 
     Attributes
     ----------
     dataset, split, seed
-        What is trained on; the seed decides split, training and noise.
+        Training data; the seed determines split, training and noise.
     height, width, crop
-        The model's input and which part of an image it shows.
+        The model's input size and the part of the image it shows.
     backbone, weights
-        The image network and where its weights come from (``timm``, ``none`` or a file).
+        The image network and the source of its weights (``timm``, ``none`` or a file).
     augment, copies
-        How the augmented copies of each training frame are changed, and how many there are.
+        How the copies of each training frame are augmented, and how many there are.
     head
-        The method's own struct of options: the network behind the features and its loss.
+        The method's options struct: the network after the backbone and its loss.
     steps, batch_size, learning_rate, weight_decay
-        AdamW on cached features; the rate rises over 50 steps and falls as a cosine.
+        AdamW on cached features; the rate rises over 50 steps and then follows a cosine.
     warm_up_steps
-        Steps before the calibration term of the loss begins.
+        Steps before the loss includes the calibration term.
     averaging
-        Decay of the running mean of the weights that is evaluated and kept.
+        Decay of the moving average of the weights, which is evaluated and saved.
     fine_tune, backbone_learning_rate
-        Epochs in which the backbone learns, too, on fresh augmented images; the copies are then
-        computed anew and the head trained once more.
+        Epochs that train the backbone as well, on fresh augmented images; afterwards the copies'
+        features are recomputed and the head is trained again.
     share
-        Of the training frames, how many are used: to see what a method needs.
+        Fraction of the training frames used, to study how much data a method needs.
     """
 
     dataset: str
@@ -79,14 +79,14 @@ class TrainConfig:
 
     @property
     def method(self) -> str:
-        """Name of the method or baseline, the tag of its options."""
+        """Name of the method or baseline: the tag of its options."""
         return str(self.head.__struct_config__.tag)
 
 
 def decode_config(content: bytes) -> TrainConfig:
-    """Read what ``config.json`` holds; raises msgspec.MsgspecError where it is something else.
+    """Decode the content of ``config.json``; raises msgspec.MsgspecError if it is invalid.
 
-    The method's options are read on their own: a method may have been registered after this module
+    The method's options are decoded separately: a method may have been registered after this module
     was imported.
     """
     config = msgspec.json.decode(content, type=TrainConfig)
@@ -96,8 +96,8 @@ def decode_config(content: bytes) -> TrainConfig:
 class History(NamedTuple):
     """One evaluation on val.
 
-    ``candidate`` tells whether val may choose the network, as it may not those of other folds and
-    models of residuals.
+    ``candidate`` tells whether val may select the network; it is False for networks of other folds
+    and models of residuals.
     """
 
     lesson: str
@@ -109,7 +109,7 @@ class History(NamedTuple):
 
 
 class PoseGraph(nn.Module):
-    """What is exported: images (n, height, width, 3), uint8 RGB -> the method's outputs."""
+    """The exported graph: images (n, height, width, 3), uint8 RGB -> the method's outputs."""
 
     def __init__(self, backbone: Backbone, head: ExportedHead) -> None:
         super().__init__()
@@ -117,14 +117,14 @@ class PoseGraph(nn.Module):
         self.head = head
 
     def forward(self, image: Tensor, *extra: Tensor) -> tuple[Tensor, ...]:
-        """Return the head's outputs, of the names in ``head.output_names``."""
+        """Return the outputs that ``head.output_names`` names."""
         outputs: tuple[Tensor, ...] = self.head(self.backbone(image), *extra)
         return outputs
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: what it was asked for, what it learned, and how that went."""
+    """A finished run: its configuration, its trained network and its history."""
 
     config: TrainConfig
     dataset: PoseDataset
@@ -135,7 +135,7 @@ class Run:
     history: list[History]
 
     def save(self, run_dir: Path) -> None:
-        """Write what training learned, whole or not at all; raises SinkError."""
+        """Write the result of training atomically; raises SinkError."""
         target = (self.target.reference_q_xyzw, self.target.mean, self.target.std)
         content = {
             "backbone": self.graph.backbone.state_dict(),
@@ -149,7 +149,7 @@ class Run:
 
     @property
     def best(self) -> History:
-        """The evaluation of the weights that were kept, among all candidates of the last phase."""
+        """The evaluation of the saved weights: the best candidate of the last phase."""
         last_phase = max(entry.phase for entry in self.history)
         return min(
             (entry for entry in self.history if entry.phase == last_phase and entry.candidate),
@@ -157,7 +157,7 @@ class Run:
         )
 
     def lines(self) -> list[str]:
-        """Return what was trained as lines of text for a person."""
+        """Return a summary of the run as lines of text."""
         counts = ", ".join(f"{role} {indices.size}" for role, indices in self.split.roles.items())
         best = self.best
         parameters = sum(parameter.numel() for parameter in self.graph.parameters())
@@ -169,25 +169,26 @@ class Run:
 
 
 def open_run(run_dir: Path, config: TrainConfig) -> tuple[PoseDataset, Split]:
-    """Open the data set of a configuration and make its split; nothing is written yet.
+    """Open the data set of a configuration and split it; writes nothing.
 
-    Raises UsageError where the folder belongs to another configuration.
+    Raises UsageError if the folder belongs to another configuration.
     """
     path = run_dir / CONFIG_FILE
     if run_dir.exists() and not run_dir.is_dir():
         raise SinkError(f"{run_dir}: expected a folder, found a file")
     if path.is_file() and path.read_bytes() != _encoded(config):
         raise UsageError(
-            f"{run_dir}: expected a new folder or a run of the same options, found another run"
+            f"{run_dir}: expected a new folder or a run of the same options, found another run; "
+            "choose another folder"
         )
     dataset = open_dataset(config.dataset)
     return dataset, make_split(dataset, config.split, config.seed)
 
 
 def claim_run(run_dir: Path, config: TrainConfig, dataset: PoseDataset, split: Split) -> None:
-    """Write configuration and split, once everything that may be refused has been tried.
+    """Write configuration and split, once all checks have passed.
 
-    Raises SinkError where the folder cannot be written.
+    Raises SinkError if the folder cannot be written.
     """
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -202,10 +203,10 @@ def _encoded(config: TrainConfig) -> bytes:
 
 
 def load_run(run_dir: Path, dataset: str | None = None) -> Run:
-    """Read a finished run; ``dataset`` says where its data set is now, if it has moved.
+    """Read a finished run; ``dataset`` is the new location of its data set, if it has moved.
 
-    Raises UsageError where the folder holds no finished run, SourceError where the data set is not
-    the one that was split.
+    Raises UsageError if the folder holds no finished run, SourceError if the data set is not the
+    one that was split.
     """
     path = run_dir / NETWORK_FILE
     if not path.is_file():
@@ -214,10 +215,10 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
         config = decode_config((run_dir / CONFIG_FILE).read_bytes())
         recorded = read_split_spec(run_dir / SPLIT_FILE)
         stored = torch.load(path, weights_only=True)
-    # torch.load raises what its unpickler and its zip reader happen to raise.
+    # torch.load passes on any error of its unpickler and its zip reader.
     except Exception as error:  # noqa: BLE001
         line = " ".join(str(error).split())[:120]
-        raise UsageError(f"{run_dir}: expected the files of a finished run, found {line}") from None
+        raise UsageError(f"{run_dir}: cannot read the files of the run: {line}") from None
     opened = open_dataset(dataset or config.dataset)
     split = same_split(opened, recorded)
     target = Target(*(values.numpy() for values in stored["target"]))
@@ -229,8 +230,8 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
         history = [History(*entry) for entry in stored["history"]]
     except (RuntimeError, TypeError):
         raise UsageError(
-            f"{run_dir}: expected a network of this release, found another one's in "
-            f"{NETWORK_FILE}; train it anew"
+            f"{run_dir}: expected a network of this release, found another release's in "
+            f"{NETWORK_FILE}; train it again"
         ) from None
     graph = PoseGraph(backbone, head).eval()
     return Run(config, opened, split, target, graph, stored["weights_sha256"], history)

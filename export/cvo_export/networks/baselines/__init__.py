@@ -1,7 +1,7 @@
-"""What the methods are compared with: common ways to give a network's answer an uncertainty.
+"""Baselines: common ways to give a network's prediction an uncertainty.
 
-Each is trained, published and evaluated as a method is; its bundle is one of ``cqr``, so that the
-runtime knows nothing of baselines.
+Baselines are trained, published and evaluated like methods. Their bundles use the runtime method
+``cqr``, so the runtime needs no code for them.
 """
 
 from __future__ import annotations

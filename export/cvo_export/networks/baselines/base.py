@@ -1,8 +1,8 @@
-"""What the baselines have in common: a network that gives a point and its own 90 % interval.
+"""Shared code of the baselines: a network that predicts a point and its own 90 % interval.
 
-None has a score of its own. Its graph gives ``pose``, ``lower`` and ``upper``, and the runtime's
-conformalized quantile regression (``cvo_edge.heads.cqr``) makes them valid: the split conformal
-finish of Romano, Patterson and Candes 2019, the same for all.
+Baselines define no score. The graph outputs ``pose``, ``lower`` and ``upper``, and the runtime's
+conformalized quantile regression (``cvo_edge.heads.cqr``) makes the bounds valid with the split
+conformal correction of Romano, Patterson and Candes 2019.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ from cvo_export.networks.standardised import PoseDecoder
 
 Array = NDArray[np.float64]
 
-# 1.645: of a Gaussian 90 % lie within so many standard deviations of its mean.
+# 90 % of a Gaussian lies within 1.645 standard deviations of its mean.
 Z = NormalDist().inv_cdf(HIGH)
 
 
 class TrunkConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """Options that all baselines have."""
+    """Options shared by all baselines."""
 
     hidden: Hidden = (256, 128)
     feature_noise: FeatureNoise = 0.1
 
 
 class IntervalNetwork(Learner):
-    """Features (n, size) -> point, lower and upper (n, 6), standardised; and its loss."""
+    """Features (n, size) -> standardised point, lower and upper (n, 6); defines its loss."""
 
     def __init__(self, size: int, config: TrunkConfig) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class IntervalNetwork(Learner):
         """Features (n, size) -> point, lower, upper (n, 6)."""
 
     def val_score(self, features: Tensor, y: Array) -> float:
-        """As ``Learner``; of the network's own bounds with the additive score."""
+        """See ``Learner``; scores the network's own bounds with the additive score."""
         _, lower, upper = self(features)
         return conformalised_score(lower.double().numpy(), upper.double().numpy(), y)
 
@@ -84,14 +84,14 @@ class IntervalHead(ExportedHead):
         return self.decoder.pose(point), lower, upper
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """Normalised before additive: factors carry over to harder or easier recordings."""
+        """Put the normalised score first: its factors transfer to harder or easier recordings."""
         return interval_candidates(self._method_parameters)
 
 
 def interval_method(
     config: type[TrunkConfig], build: Callable[[Setting, Any], IntervalNetwork]
 ) -> Method:
-    """Return the method that trains in one lesson what ``build`` makes of its options."""
+    """Return a method that trains the network made by ``build`` in one lesson."""
 
     def train(lessons: Lessons, chosen: TrunkConfig) -> IntervalHead:
         setting = lessons.setting
@@ -107,7 +107,7 @@ def interval_method(
 
 
 def interval_parameters(setting: Setting) -> CqrParameters:
-    """``method_parameters`` of every baseline's bundle."""
+    """Return the ``method_parameters`` that every baseline's bundle stores."""
     return CqrParameters(half_width_floor=half_width_floor(setting.target), sides="symmetric")
 
 
@@ -127,13 +127,13 @@ def gaussian_interval(mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def moments(outputs: Tensor) -> tuple[Tensor, Tensor]:
-    """Outputs of a trunk (..., 12) -> mean and log variance (..., 6)."""
+    """Split trunk outputs (..., 12) into mean and log variance (..., 6)."""
     mean, log_variance = outputs[..., :DOF], outputs[..., DOF:]
-    # Beyond +-10 a variance is zero or infinite in float32; early steps do go there.
+    # Clamp to +-10: early steps go further, where the variance under- or overflows in float32.
     return mean, log_variance.clamp(-10.0, 10.0)
 
 
 def gaussian_loss(mean: Tensor, log_variance: Tensor, y: Tensor) -> Tensor:
-    """Negative log likelihood up to a constant, mean over all; shapes (..., 6)."""
+    """Return the mean negative log likelihood, up to a constant; shapes (..., 6)."""
     terms = 0.5 * (log_variance + (y - mean).square() * (-log_variance).exp())
     return terms.mean()

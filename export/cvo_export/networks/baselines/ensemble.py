@@ -1,9 +1,8 @@
-"""A deep ensemble: five Gaussian networks that began differently.
+"""A deep ensemble: five Gaussian networks with different initial weights.
 
-Lakshminarayanan, Pritzel and Blundell 2017: each member gives mean and variance and is trained by
-the likelihood on all the data, from an initialisation of its own; their mixture is taken as the
-Gaussian of its mean and variance. The members share the batches of one lesson, but not the noise on
-the features.
+Lakshminarayanan, Pritzel and Blundell 2017: each member predicts mean and variance and is trained
+by maximum likelihood on all data. The mixture is approximated by a Gaussian with the mixture's mean
+and variance. The members share the batches of one lesson, but each draws its own feature noise.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class EnsembleNetwork(IntervalNetwork):
         self.members = nn.ModuleList(trunk(size, config, 2 * DOF) for _ in range(MEMBERS))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As ``IntervalNetwork``: mean and variance of the mixture, their section 2.4."""
+        """See ``IntervalNetwork``; mean and variance of the mixture, section 2.4 of the paper."""
         means, log_variances = self.moments(features)
         mean = means.mean(dim=1)
         spread = (means - mean[:, None]).square().mean(dim=1)
@@ -48,12 +47,12 @@ class EnsembleNetwork(IntervalNetwork):
 
     def moments(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Features (n, size) -> the members' means and log variances (n, 5, 6)."""
-        # Each call draws noise of its own while training.
+        # During training, each call draws new noise.
         found = [member(self.standardise(features)) for member in self.members]
         return moments(torch.stack(found, dim=1))
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
-        """Mean over the members of the negative log likelihood, up to a constant."""
+        """Return the members' mean negative log likelihood, up to a constant."""
         return gaussian_loss(*self.moments(features), y[:, None])
 
 

@@ -1,4 +1,4 @@
-"""A heteroscedastic Gaussian: the network gives mean and variance of each degree of freedom.
+"""A heteroscedastic Gaussian: the network predicts mean and variance per degree of freedom.
 
 Trained by the negative log likelihood (Nix and Weigend 1994; the aleatoric part of Kendall and Gal
 2017).
@@ -27,14 +27,14 @@ class GaussianConfig(
 
 
 class GaussianNetwork(IntervalNetwork):
-    """The trunk with a mean and a log variance for each degree of freedom."""
+    """The trunk with a mean and a log variance per degree of freedom."""
 
     def __init__(self, setting: Setting, config: GaussianConfig) -> None:
         super().__init__(setting.feature_size, config)
         self.layers = trunk(setting.feature_size, config, 2 * DOF)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As ``IntervalNetwork``."""
+        """See ``IntervalNetwork``."""
         mean, log_variance = self.moments(features)
         return gaussian_interval(mean, (0.5 * log_variance).exp())
 
@@ -43,7 +43,7 @@ class GaussianNetwork(IntervalNetwork):
         return moments(self.layers(self.standardise(features)))
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
-        """Negative log likelihood up to a constant; features (n, size), truth (n, 6)."""
+        """Return the negative log likelihood up to a constant; features (n, size), truth (n, 6)."""
         return gaussian_loss(*self.moments(features), y)
 
 

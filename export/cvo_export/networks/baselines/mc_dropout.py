@@ -1,9 +1,9 @@
-"""Monte Carlo dropout: the spread of one network's answers under 30 dropout masks.
+"""Monte Carlo dropout: the spread of one network's predictions under 30 dropout masks.
 
-After Gal and Ghahramani 2016: dropout stays on at inference, and mean and variance of the passes
-are those of a Gaussian. Their constant 1/tau, the variance of the observations, is not added: the
-interval is of the spread alone. The 30 masks are drawn once, from the run's seed, so
-that the same image has the same answer; backbone and first layer are computed once a frame.
+After Gal and Ghahramani 2016: dropout stays on at inference, and the interval is that of a Gaussian
+with the mean and variance of the passes. The observation variance 1/tau of the paper is not added:
+the interval reflects the spread only. The 30 masks are drawn once, from the run's seed, so that an
+image always gets the same prediction. The backbone and the first layer run once per frame.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class McDropoutConfig(
 
 
 class McDropoutNetwork(IntervalNetwork):
-    """The point network with dropout behind both hidden layers, averaged over fixed masks.
+    """The point network with dropout after both hidden layers, averaged over fixed masks.
 
     Buffers ``wide_masks`` (30, wide) and ``narrow_masks`` (30, narrow) hold 0 or 1/(1 - rate).
     """
@@ -55,13 +55,13 @@ class McDropoutNetwork(IntervalNetwork):
         self.narrow_masks: Tensor
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As ``IntervalNetwork``."""
+        """See ``IntervalNetwork``."""
         points = self.passes(features)
         mean = points.mean(dim=1)
         return gaussian_interval(mean, (points - mean[:, None]).square().mean(dim=1).sqrt())
 
     def passes(self, features: Tensor) -> Tensor:
-        """Features (n, size) -> points under each mask, (n, 30, 6)."""
+        """Features (n, size) -> one point per mask, (n, 30, 6)."""
         first, second, last = self._stages()
         wide = first(self.standardise(features))[:, None] * self.wide_masks
         narrow = second(wide.flatten(0, 1)).unflatten(0, (-1, PASSES)) * self.narrow_masks
@@ -69,12 +69,12 @@ class McDropoutNetwork(IntervalNetwork):
         return points
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
-        """Mean absolute error under masks drawn anew for each row, as of the point network."""
+        """Return the point network's mean absolute error, with new masks for each row."""
         error: Tensor = self.layers(self.standardise(features)) - y
         return error.abs().mean()
 
     def _stages(self) -> tuple[nn.Module, nn.Module, nn.Module]:
-        """Return what lies before, between and behind the two dropout layers."""
+        """Return the layers before, between and after the two dropout layers."""
         return self.layers[0:2], self.layers[3:5], self.layers[6]
 
 

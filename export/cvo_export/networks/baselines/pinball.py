@@ -1,6 +1,6 @@
-"""Quantile regression by the pinball loss: one network gives median, 5 % and 95 % quantiles.
+"""Quantile regression with the pinball loss: one network predicts median, 5 % and 95 % quantiles.
 
-After Koenker and Bassett 1978. The three are put in order, so that they never cross
+After Koenker and Bassett 1978. The three outputs are sorted so that they never cross
 (Chernozhukov, Fernandez-Val and Galichon 2010).
 """
 
@@ -23,24 +23,24 @@ class PinballConfig(
 
 
 class PinballNetwork(IntervalNetwork):
-    """The trunk with three quantiles for each degree of freedom."""
+    """The trunk with three quantiles per degree of freedom."""
 
     def __init__(self, setting: Setting, config: PinballConfig) -> None:
         super().__init__(setting.feature_size, config)
         self.layers = trunk(setting.feature_size, config, 3 * DOF)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As ``IntervalNetwork``; the point is the median."""
+        """See ``IntervalNetwork``; the point is the median."""
         lower, point, upper = self.quantiles(features).sort(dim=1).values.unbind(dim=1)
         return point, lower, upper
 
     def quantiles(self, features: Tensor) -> Tensor:
-        """Features (n, size) -> the three as they come, (n, 3, 6)."""
+        """Features (n, size) -> the three quantiles before sorting, (n, 3, 6)."""
         found: Tensor = self.layers(self.standardise(features)).unflatten(1, (3, DOF))
         return found
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
-        """Mean pinball loss of the three; features (n, size), truth (n, 6)."""
+        """Return the mean pinball loss of the three quantiles; features (n, size), truth (n, 6)."""
         above = y[:, None] - self.quantiles(features)
         return torch.maximum(_LEVELS * above, (_LEVELS - 1.0) * above).mean()
 

@@ -1,4 +1,4 @@
-"""Plain split conformal prediction on a point network: intervals of one width for all frames.
+"""Plain split conformal prediction on a point network: all frames get intervals of equal width.
 
 After Lei, G'Sell, Rinaldo, Tibshirani and Wasserman 2018: the score is the absolute residual.
 """
@@ -23,7 +23,7 @@ class SplitConfig(
 
 
 class SplitHead(ExportedHead):
-    """Features -> pose (n, 7) alone."""
+    """Features -> pose (n, 7) only."""
 
     output_names = ("pose",)
     runtime_method = "cqr"
@@ -39,7 +39,7 @@ class SplitHead(ExportedHead):
         return (self.decoder.pose(self.decoder(self.network(features))),)
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """Return the only score that needs no bounds."""
+        """Return the absolute residual, the only score that needs no bounds."""
         return (Candidate("residual", self._method_parameters),)
 
 

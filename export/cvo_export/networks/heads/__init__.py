@@ -1,7 +1,7 @@
-"""The networks, one method a file, of the same names as in ``cvo_edge.heads``.
+"""The methods' networks, one module per method, named as in ``cvo_edge.heads``.
 
-``METHODS`` is the registry: a new method is one file here, one of the same name in the runtime, and
-one line in each registry.
+``METHODS`` is the registry. A new method needs one module here, one of the same name in the
+runtime, and one line in each registry.
 """
 
 from __future__ import annotations

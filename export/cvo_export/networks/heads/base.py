@@ -1,4 +1,4 @@
-"""What every method provides to the training side: what is trained, and what is exported."""
+"""Interface between a method and the training side: what is trained and what is exported."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ DOF = 6
 
 
 class Standardise(nn.Module):
-    """Features (n, size) -> features of mean 0 and deviation 1 over the training images.
+    """Scale features (n, size) to mean 0 and deviation 1 over the training images.
 
-    While training, Gaussian noise of deviation ``noise`` is added.
+    During training, Gaussian noise of deviation ``noise`` is added.
     """
 
     def __init__(self, size: int, noise: float) -> None:
@@ -41,10 +41,10 @@ class Standardise(nn.Module):
         self.std: Tensor
 
     def fit(self, features: NDArray[np.float16] | NDArray[np.float32]) -> None:
-        """Take mean and deviation from features (copies, n, size)."""
+        """Set mean and deviation from features (copies, n, size)."""
         deviation = features.std((0, 1), dtype=np.float64)
         self.mean.copy_(torch.from_numpy(features.mean((0, 1), dtype=np.float64)))
-        # A feature that is nearly always zero would be blown up where it is not.
+        # Without a floor, a feature that is nearly always zero would explode where it is not.
         self.std.copy_(torch.from_numpy(deviation + 0.1 * deviation.mean()))
 
     def forward(self, features: Tensor) -> Tensor:
@@ -54,15 +54,15 @@ class Standardise(nn.Module):
 
 
 def dense(inputs: int, outputs: int, dropout: float = 0.0) -> list[nn.Module]:
-    """Return a layer of the trunks: linear, PReLU and, where asked for, dropout."""
+    """Return one layer of a trunk: linear, PReLU and, if ``dropout`` is above 0, dropout."""
     layer: list[nn.Module] = [nn.Linear(inputs, outputs), nn.PReLU(outputs)]
     return [*layer, nn.Dropout(dropout)] if dropout > 0 else layer
 
 
 class Learner(nn.Module):
-    """What one lesson of the training loop trains: a network with its loss.
+    """A network and its loss, trained by one lesson of the training loop.
 
-    ``standardise`` is filled in before the first step.
+    The training loop fills ``standardise`` before the first step.
     """
 
     standardise: Standardise
@@ -73,14 +73,14 @@ class Learner(nn.Module):
 
     @abstractmethod
     def val_score(self, features: Tensor, y: Array) -> float:
-        """Return the figure that decides on val: mean interval score at 90 %, standardised (n, 6).
+        """Return the val score: mean interval score at 90 %, on standardised numbers (n, 6).
 
-        Close to what the bundle will be judged by; but thresholds are taken on val itself.
+        It is close to the figure that judges the bundle, but its thresholds come from val itself.
         """
 
 
 def conformalised_score(lower: Array, upper: Array, y: Array) -> float:
-    """Mean interval score at 90 % of bounds (n, 6), corrected on these very truths (n, 6)."""
+    """Return the mean interval score at 90 % of bounds (n, 6) calibrated on the same truths."""
     scores = np.maximum(lower - y, y - upper)
     q_hat = np.array([conformal_quantile(scores[:, dof], 0.9) for dof in range(DOF)])
     lower, upper = lower - q_hat, upper + q_hat
@@ -92,18 +92,18 @@ L = TypeVar("L", bound=Learner)
 
 
 class ExportedHead(nn.Module):
-    """Features (n, size) -> the method's outputs in metres and radians, as they are exported.
+    """Features (n, size) -> the method's exported outputs, in metres and radians.
 
     Attributes
     ----------
     output_names
-        Of the tuple that ``forward`` returns; the first is ``pose`` (n, 7).
+        Names of the outputs that ``forward`` returns; the first is ``pose`` (n, 7).
     runtime_method
-        The method of the runtime that reads these outputs.
+        The runtime method that reads these outputs.
     rotation
         The chart of the six numbers.
     extra_inputs
-        Name -> an example of every further argument of ``forward``.
+        Name -> example value of each additional argument of ``forward``.
     """
 
     output_names: tuple[str, ...]
@@ -113,23 +113,23 @@ class ExportedHead(nn.Module):
 
     @abstractmethod
     def candidates(self) -> tuple[Candidate, ...]:
-        """Return what val chooses among; the first stands unless another is clearly better."""
+        """Return the scores val chooses from; the first wins unless another is clearly better."""
 
     def choices(self) -> Mapping[str, float]:
-        """What val chose inside of this head, for the provenance; by default nothing."""
+        """Return what val chose inside this head, for the provenance; empty by default."""
         return {}
 
     def completed(self, content: bytes) -> bytes:
-        """Add to an exported model what torch cannot export; by default nothing."""
+        """Add the parts that torch cannot export to an exported model; by default nothing."""
         return content
 
     def completed_outputs(self, outputs: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
-        """What the completed model must give where the exported one gives ``outputs``."""
+        """Return the completed model's expected outputs, given the exported model's ``outputs``."""
         return outputs
 
 
 class Setting(NamedTuple):
-    """What every head is built from: number of features, target, and the run's seed."""
+    """Inputs to every head's constructor: number of features, target, and the run's seed."""
 
     feature_size: int
     target: Target
@@ -137,9 +137,9 @@ class Setting(NamedTuple):
 
 
 class Examples(NamedTuple):
-    """What a lesson learns from, where that is not the features.
+    """Training data of a lesson that does not learn from features.
 
-    Inputs (copies, n, size) and truths (copies, n, 6) of the training images in any number of
+    Inputs (copies, n, size) and truths (copies, n, 6) of the training images, for any number of
     copies; inputs (n_val, size) and truths (n_val, 6) of val.
     """
 
@@ -150,13 +150,13 @@ class Examples(NamedTuple):
 
 
 class Lessons(Protocol):
-    """What the training loop offers to a method."""
+    """What the training loop offers a method."""
 
     setting: Setting
-    # Number of training images; the first n_train have the role train, those after them fit.
+    # Number of training images: the first n_train have the role train, the rest the role fit.
     n_images: int
     n_train: int
-    # Whether the backbone learns, too: then residuals on frames that it has seen are too small.
+    # Whether the backbone is trained as well; residuals on frames it has seen are then too small.
     fine_tuned: bool
 
     def learn(
@@ -167,31 +167,31 @@ class Lessons(Protocol):
         examples: Examples | None = None,
         candidate: bool = True,
     ) -> L:
-        """Train what ``build`` makes on these rows, all by default; kept and resumed by name.
+        """Train the network made by ``build`` on these rows (default: all).
 
-        On features and standardised poses, unless other ``examples`` are given. ``candidate`` is
-        False for a network that is not kept, or only models residuals: its score on val is not the
-        run's.
+        The result is stored and resumed by name. Uses features and standardised poses unless
+        ``examples`` are given. Pass ``candidate=False`` for a network that is discarded or only
+        models residuals: its val score is not the run's.
         """
 
     def folds(self, count: int) -> list[Indices]:
-        """Rows of the training images, dealt into folds by the split's own unit."""
+        """Split the rows of the training images into folds, by the unit of the data split."""
 
     def poses(self) -> Array:
-        """Poses (n, 7) of the training images."""
+        """Return the poses (n, 7) of the training images."""
 
     def val(self) -> tuple[Tensor, Array]:
-        """Features (n_val, size) and poses (n_val, 7) of val."""
+        """Return features (n_val, size) and poses (n_val, 7) of val."""
 
     def features(self) -> tuple[NDArray[np.float16], Array]:
-        """Features (copies + 1, n, size) and poses (copies + 1, n, 7); the first is unchanged."""
+        """Features (copies + 1, n, size), poses (copies + 1, n, 7); copy 0 is not augmented."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """One method: its options, how it is trained, and how a finished one is read back.
+    """One method: its options, its training, and how to restore a trained head.
 
-    ``restore`` takes the state of a finished head and returns it, of the same setting and options.
+    ``restore`` rebuilds a head from its state dict, given the setting and options of its training.
     """
 
     config: type[Struct]
@@ -200,10 +200,10 @@ class Method:
 
 
 def interval_candidates(parameters: Struct) -> tuple[Candidate, ...]:
-    """Normalised before additive: factors carry over to harder or easier recordings."""
+    """Put the normalised score first: its factors transfer to harder or easier recordings."""
     return (Candidate("normalised", parameters), Candidate("additive", parameters))
 
 
 def half_width_floor(target: Target) -> Six:
-    """Least half-width per DoF in the normalised score, from the poses' deviation."""
+    """Return the least half-width per DoF for the normalised score, from the poses' deviation."""
     return six(HALF_WIDTH_FLOOR * target.std)

@@ -146,7 +146,7 @@ class CjpMember(nn.Module):
     def encode(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Features (n, size) -> mean and log variance of the latent, (n, latent_size) each."""
         hidden = self.encoder(x)
-        # Beyond +-10 a variance is zero or infinite in float32; early steps do go there.
+        # Clamp to +-10: early steps go further, where the variance under- or overflows in float32.
         return self.mu(hidden), self.log_variance(hidden).clamp(-10.0, 10.0)
 
     def decode(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -157,14 +157,14 @@ class CjpMember(nn.Module):
         return point, point - softplus(a), point + softplus(b)
 
     def forward(self, x: Tensor, noise: Tensor | None = None) -> CjpPrediction:
-        """Features (n, size), latent noise (n, latent_size) or None for the latent's mean."""
+        """Features (n, size), latent noise (n, latent_size); without noise, uses the mean."""
         mu, log_variance = self.encode(x)
         z = mu if noise is None else mu + noise * torch.exp(0.5 * log_variance)
         return CjpPrediction(*self.decode(z), mu, log_variance)
 
 
 class CjpNetwork(nn.Module):
-    """Features (n, size) -> point, lower, upper (n, 6), standardised: the mean of the members'."""
+    """Features (n, size) -> standardised point, lower, upper (n, 6), averaged over the members."""
 
     def __init__(self, size: int, config: CjpConfig) -> None:
         super().__init__()
@@ -177,9 +177,9 @@ class CjpNetwork(nn.Module):
     def forward(
         self, features: Tensor, noise: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Features (n, size), as inference draws the latent.
+        """Predict from features (n, size), with the latent that inference uses.
 
-        noise (n, latent_size) in ``sample`` mode only, the same for all members.
+        noise (n, latent_size) is used in ``sample`` mode only and shared by all members.
         """
         x = self.standardise(features)
         found = [self._drawn(cast("CjpMember", member), x, noise) for member in self.members]
@@ -191,9 +191,9 @@ class CjpNetwork(nn.Module):
         return point, lower, upper
 
     def samples(self, features: Tensor) -> CjpPrediction:
-        """Features (n, size) -> each member's (members * n, ...), one after the other.
+        """Features (n, size) -> predictions of all members, concatenated to (members * n, ...).
 
-        For training: the latent is sampled, and each member draws noise of its own.
+        For training: the latent is sampled, and each member draws its own noise.
         """
         found = []
         for member in self.members:
@@ -218,7 +218,7 @@ class CjpNetwork(nn.Module):
 
 
 class CjpLearner(Learner):
-    """The network with Eq. 6: point + beta KL + INTSCORE + COMCAL, on standardised numbers."""
+    """The network with the loss of Eq. 6: point + beta KL + INTSCORE + COMCAL, standardised."""
 
     def __init__(self, size: int, config: CjpConfig) -> None:
         super().__init__()
@@ -228,7 +228,7 @@ class CjpLearner(Learner):
         self.combined_calibration = CombinedCalibrationLoss(DOF, config.sharpness, config.gate)
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
-        """Features (n, size), truth (n, 6) -> scalar; in warm-up without the calibration term."""
+        """Features (n, size), truth (n, 6) -> scalar; warm-up omits the calibration term."""
         prediction = self.network.samples(features)
         return self.of_prediction(prediction, y.repeat(self.config.members, 1), warm_up)
 
@@ -241,12 +241,12 @@ class CjpLearner(Learner):
             + self.config.kl_weight * kl_divergence(mu, log_variance)
             + interval_score_loss(lower, upper, y, self.config.interval_form)
         )
-        # Running coverages must see the warm-up, too: they gate what comes after it.
+        # Update running coverages during warm-up: they gate the calibration term afterwards.
         combined = self.combined_calibration(lower, upper, y)
         return loss if warm_up else loss + combined
 
     def val_score(self, features: Tensor, y: Array) -> float:
-        """As ``Learner``; of the network's own bounds with the additive score."""
+        """See ``Learner``; scores the network's own bounds with the additive score."""
         _, lower, upper = self.network(features)
         return conformalised_score(lower.double().numpy(), upper.double().numpy(), y)
 
@@ -279,7 +279,7 @@ class CjpHead(ExportedHead):
         return self.decoder.pose(point), lower, upper
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """Normalised before additive: factors carry over to harder or easier recordings."""
+        """Put the normalised score first: its factors transfer to harder or easier recordings."""
         return interval_candidates(self._method_parameters)
 
 

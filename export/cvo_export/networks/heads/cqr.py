@@ -1,13 +1,13 @@
 """Conformalized quantile regression with a forest: the spread of a point network's residuals.
 
-The paper's section III-A. A point network gives the pose; a quantile regression forest, on the
-compressed features and that pose, gives the 5 % and 95 % quantiles of the residual
+The paper's section III-A. A point network predicts the pose. A quantile regression forest takes the
+compressed features and that pose and predicts the 5 % and 95 % quantiles of the residual
 
     e = (t - t_hat, Log(R_hat^T R)),
 
-which never wraps and is far narrower than the pose. Residuals must come from frames that their
-network has not been trained on, or they are too small: from networks trained on the other folds
-(``cross_fitted``), or from the role ``fit`` with the network trained on ``train`` (``held_out``).
+which never wraps and has a far smaller range than the pose. Residuals of frames that the point
+network was trained on are too small. They therefore come from networks trained on the other folds
+(``cross_fitted``), or from the role ``fit`` with a network trained on ``train`` (``held_out``).
 """
 
 from __future__ import annotations
@@ -86,14 +86,14 @@ class CqrConfig(Struct, frozen=True, tag="cqr", tag_field="method", forbid_unkno
     feature_noise: FeatureNoise = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse levels that bound nothing."""
+        """Reject quantiles that are out of range or out of order."""
         low, high = self.quantiles
         if not 0.0 < low < high < 1.0:
             raise ValueError(f"quantiles: expected 0 < low < high < 1, found {low} and {high}")
 
 
 class CqrHead(ExportedHead):
-    """Features -> pose (n, 7) and the forest's input; ``completed`` with lower and upper."""
+    """Features -> pose (n, 7) and the forest's input; ``completed`` adds lower and upper."""
 
     output_names = ("pose", "forest_input")
     runtime_method = "cqr"
@@ -130,13 +130,13 @@ class CqrHead(ExportedHead):
         return pose, torch.cat([compressed, point], dim=1)
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """Normalised before additive: factors carry over to harder or easier recordings."""
+        """Put the normalised score first: its factors transfer to harder or easier recordings."""
         return interval_candidates(self._method_parameters)
 
     def completed(self, content: bytes) -> bytes:
-        """Put the forests behind ``forest_input`` and the bounds in its place.
+        """Append the forests to ``forest_input`` and output the bounds instead of it.
 
-        lower, upper = (t_hat, 0) + quantile: numbers in the chart about the prediction.
+        lower, upper = (t_hat, 0) + quantile, in the chart centred at the prediction.
         """
         model = onnx.load_from_string(content)
         graph = model.graph
@@ -178,7 +178,7 @@ class CqrHead(ExportedHead):
         return completed
 
     def completed_outputs(self, outputs: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
-        """The same in numpy, from the outputs of the model before; equal to the last bit."""
+        """Compute the same bounds in numpy from the exported model's outputs, bit for bit."""
         pose, x = outputs["pose"], outputs["forest_input"]
         bounds = {}
         for name, tau in zip(("lower", "upper"), self._quantiles, strict=True):
@@ -187,7 +187,7 @@ class CqrHead(ExportedHead):
         return {"pose": pose, **bounds}
 
 
-# A prediction is at its own translation and at the origin of its own tangent.
+# In its own tangent chart, a prediction has its translation and zero rotation.
 _ORIGIN = np.array([1, 1, 1, 0, 0, 0], dtype=np.float32)
 
 
@@ -197,7 +197,7 @@ def _train(lessons: Lessons, config: CqrConfig) -> CqrHead:
     held_out = learn_held_out(lessons, "cqr", config.residuals, config.hidden, config.feature_noise)
     network, rows = held_out.network, held_out.rows
     features, poses = lessons.features()
-    # Evenly over the grades; each once, where there are fewer copies than asked for.
+    # Spread the chosen copies evenly over the grades; use all copies if there are too few.
     spread = np.linspace(0, len(features) - 1, config.forest_copies + 2)[:-1]
     copies = np.unique(spread.round().astype(int))
     features, poses = features[copies], poses[copies]

@@ -1,7 +1,7 @@
-"""Conformalized set prediction: every degree of freedom as K classes, one softmax each.
+"""Conformalized set prediction: K classes and a softmax per degree of freedom.
 
-The paper's section III-B. Classes are cut at the quantiles of the training poses, so that they are
-narrow where the camera was often; a shared trunk gives the logits of all six degrees of freedom.
+The paper's section III-B. Class edges are quantiles of the training poses, so that classes are
+narrow where poses are dense. A shared trunk outputs the logits of all six degrees of freedom.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from cvo_export.networks.standardised import PoseDecoder
 
 Array = NDArray[np.float64]
 
-# The workspace ends this far beyond the training poses, in ranges of each DoF.
+# Margin of the workspace beyond the training poses, as a fraction of each DoF's range.
 _MARGIN = 0.1
 _TEMPERATURES = np.exp(np.linspace(np.log(0.1), np.log(10.0), 97))
-# Values of Angelopoulos et al. 2021, appendix: which is best depends on the network.
+# Values from the appendix of Angelopoulos et al. 2021; the best one depends on the network.
 _PENALTIES = (0.001, 0.01, 0.1, 0.2, 0.5)
 _FREE_RANKS = 5
-# Narrow labels where classes are as wide as the errors, wide ones on new recordings. The middle one
-# where only one network can be trained.
+# Narrow labels suit classes as wide as the errors, wide labels suit new recordings. The middle
+# value is used where only one network can be trained.
 _SIGMAS = (1.5, 4.0, 10.0)
 
 
@@ -79,8 +79,8 @@ class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unkno
 class Classes(nn.Module):
     """The classes of all six degrees of freedom, in standardised numbers.
 
-    Buffers ``edges`` (6, K + 1), where a DoF with fewer classes repeats its last edge, ``medians``
-    (6, K) of the training poses in each class, and ``used`` (6, K).
+    Buffers: ``edges`` (6, K + 1), where a DoF with fewer classes repeats its last edge; ``medians``
+    (6, K) of the training poses in each class; and ``used`` (6, K).
     """
 
     def __init__(self, edges: Tensor, medians: Tensor) -> None:
@@ -94,10 +94,10 @@ class Classes(nn.Module):
 
     @classmethod
     def cut(cls, y: Array, count: int) -> Classes:
-        """Cut standardised training poses (n, 6) into at most ``count`` classes a DoF."""
+        """Cut standardised training poses (n, 6) into at most ``count`` classes per DoF."""
         rows, middles = [], []
         for values in y.T:
-            # No more classes than there are gaps between poses: a camera may rest.
+            # A camera at rest repeats poses: use no more classes than there are gaps between poses.
             shares = min(count, np.unique(values).size - 1)
             edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, shares + 1)))
             margin = _MARGIN * (edges[-1] - edges[0])
@@ -112,23 +112,23 @@ class Classes(nn.Module):
             rows.append(np.append(edges, [edges[-1]] * missing))
             middles.append(np.append(medians, [0.0] * missing))
         table = torch.from_numpy(np.array(rows))
-        # Where every DoF has fewer classes than asked for, so has the network.
+        # Drop classes that no DoF uses.
         most = int((table[:, 1:] > table[:, :-1]).sum(dim=1).max())
         return cls(table[:, : most + 1], torch.from_numpy(np.array(middles))[:, :most])
 
     @property
     def count(self) -> int:
-        """K, the most classes of any DoF."""
+        """K, the largest number of classes of any DoF."""
         return int(self.used.shape[1])
 
     def index(self, y: Tensor) -> Tensor:
-        """Standardised truth (n, 6) -> its class, (n, 6); beyond the workspace the outermost."""
+        """Standardised truth (n, 6) -> class index (n, 6), clipped to the outermost classes."""
         inside = torch.arange(1, self.count) < self.used.sum(dim=1, keepdim=True)
         inner = torch.where(inside, self.edges[:, 1:-1], torch.inf)
         return torch.searchsorted(inner, y.double().T.contiguous(), right=True).T
 
     def position(self, y: Tensor) -> Tensor:
-        """Standardised truth (n, 6) -> where it lies among the classes; k in the middle of k."""
+        """Standardised truth (n, 6) -> position on the class axis; the middle of class k is k."""
         index = self.index(y).T
         low, high = self.edges.gather(1, index), self.edges.gather(1, index + 1)
         within = ((y.double().T - low) / (high - low)).clamp(0.0, 1.0)
@@ -141,7 +141,7 @@ class Classes(nn.Module):
 
 
 class CspNetwork(nn.Module):
-    """Features (n, size) -> logits (n, 6, K); those of unused classes are hugely negative."""
+    """Features (n, size) -> logits (n, 6, K); unused classes get large negative logits."""
 
     def __init__(self, size: int, config: CspConfig, classes: Classes) -> None:
         super().__init__()
@@ -163,7 +163,7 @@ class CspNetwork(nn.Module):
 
 
 class CspLearner(Learner):
-    """The network with the cross-entropy against soft or one-hot labels."""
+    """The network with the cross-entropy loss against ordinal or one-hot labels."""
 
     def __init__(self, size: int, config: CspConfig, classes: Classes, sigma: float) -> None:
         super().__init__()
@@ -173,7 +173,7 @@ class CspLearner(Learner):
         self.standardise = self.network.standardise
 
     def labels(self, y: Tensor) -> Tensor:
-        """Standardised truth (n, 6) -> what the softmax should be, (n, 6, K)."""
+        """Standardised truth (n, 6) -> target probabilities (n, 6, K)."""
         classes = self.network.classes
         if self.one_hot:
             return one_hot(classes.index(y), classes.count).float()
@@ -187,13 +187,13 @@ class CspLearner(Learner):
         return -(self.labels(y) * logarithm).sum(dim=-1).mean()
 
     def val_score(self, features: Tensor, y: Array) -> float:
-        """As ``Learner``; of the sets by the ``aps`` score."""
+        """See ``Learner``; scores the sets of the ``aps`` score."""
         probabilities = torch.softmax(self.network(features), dim=-1).double().numpy()
         return float(set_score(self.network.classes, probabilities, y).mean())
 
 
 def set_score(classes: Classes, probabilities: Array, y: Array) -> Array:
-    """Interval score at 90 % of the ``aps`` sets, (n, 6), thresholds taken on these very frames.
+    """Return the interval score at 90 % of the ``aps`` sets, (n, 6), calibrated on the same frames.
 
     Probabilities (n, 6, K), standardised truth (n, 6).
     """
@@ -242,7 +242,7 @@ class CspHead(ExportedHead):
         return self.decoder.pose(self.decoder(point)), probabilities
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """``aps`` before the paper's ``lac`` and ``raps`` with penalties of growing weight."""
+        """List ``aps`` first, then the paper's ``lac``, then ``raps`` with increasing penalties."""
         a, b, c, d, e, f = self._edges
         plain = CspParameters(edges=(a, b, c, d, e, f), penalty=0.0, free_ranks=0)
         return (
@@ -281,7 +281,7 @@ def _train(lessons: Lessons, config: CspConfig) -> CspHead:
 
 
 def best_temperatures(logits: Tensor, index: Tensor) -> Tensor:
-    """Temperature of each DoF, (6,), with the greatest likelihood of the true classes.
+    """Return the temperature per DoF, (6,), that maximises the likelihood of the true classes.
 
     Logits (n, 6, K) and classes (n, 6), on val (Guo et al. 2017).
     """

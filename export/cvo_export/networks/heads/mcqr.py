@@ -1,15 +1,14 @@
-"""Multivariate conformalized quantile regression: a region for the residual of a point network.
+"""Multivariate conformalized quantile regression: a region for a point network's residual.
 
-The paper's section IV-A. A point network gives the pose. From its compressed features and that pose
-(the condition c) an autoencoder with directional quantiles
-(``cvo_export.networks.directional``) gives a
-region of its residual
+The paper's section IV-A. A point network predicts the pose. Its compressed features and that pose
+form the condition c. From c, an autoencoder with directional quantiles
+(``cvo_export.networks.directional``) predicts a region of the residual
 
     e = (t - t_hat, Log(R_hat^T R))
 
-as a codebook of points, one static graph. Residuals come from frames that their network has not
-seen, as in CQR. The paper multiplies them by MC-dropout: stochastic passes of the point network,
-each with its own residual (``augmentation``).
+as a codebook of points, in one static graph. As in CQR, residuals come from frames that their
+network has not seen. The paper generates more of them with MC-dropout: stochastic passes of the
+point network, each with its own residual (``augmentation``).
 """
 
 from __future__ import annotations
@@ -62,10 +61,10 @@ from cvo_export.networks.standardised import PoseDecoder
 
 Array = NDArray[np.float64]
 
-# What early stopping looks at: one inflation, and few draws for the volume.
+# Early stopping evaluates one inflation and estimates volumes from few draws.
 _USUAL_KAPPA = 0.8
 _FEW_DRAWS = 100
-# Training rows that show which points of the codebook are of use.
+# Training rows used to find the useful points of the codebook.
 _USAGE_ROWS = 4000
 _DROPOUT, _PASSES = 0.05, 20
 
@@ -73,9 +72,9 @@ _DROPOUT, _PASSES = 0.05, 20
 class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unknown_fields=True):
     """Options of the region and of its point network.
 
-    The paper uses augmentation predictions and scale constant. With ``predictions`` each MC-dropout
-    pass is a point with its own condition and residual; with ``labels`` the condition stays that of
-    the deterministic point.
+    The paper uses augmentation predictions and scale constant. With ``predictions``, each
+    MC-dropout pass has its own point, condition and residual; with ``labels``, passes keep the
+    condition of the deterministic point.
     """
 
     augmentation: Annotated[
@@ -127,27 +126,27 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
     feature_noise: FeatureNoise = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse passes that are all the same, and their number where there are none."""
+        """Reject augmentation without dropout, and ``passes`` without augmentation."""
         if self.augmentation == "none" and self.passes is not None:
             raise ValueError(
-                f"passes: expected with the augmentation predictions or labels, found "
-                f"{self.passes} with none"
+                f"passes: expected only with augmentation predictions or labels, found "
+                f"{self.passes} with augmentation none"
             )
         if self.augmentation != "none" and self.dropout == 0.0:
             raise ValueError(
-                f"dropout: expected more than 0 for the passes of {self.augmentation}, found 0"
+                f"dropout: expected more than 0 with augmentation {self.augmentation}, found 0"
             )
 
     @property
     def point_dropout(self) -> float:
-        """Dropout of the point network."""
+        """Dropout rate of the point network."""
         if self.dropout is not None:
             return self.dropout
         return 0.0 if self.augmentation == "none" else _DROPOUT
 
 
 class RegionLearner(Learner):
-    """The region's networks on scaled residuals, given the condition."""
+    """The region's networks, trained on scaled residuals given the condition."""
 
     def __init__(self, config: McqrConfig) -> None:
         super().__init__()
@@ -170,7 +169,7 @@ class RegionLearner(Learner):
         return self.network.loss(self.standardise(features), y)
 
     def val_score(self, features: Tensor, y: Array) -> float:
-        """Mean volume of the region at 90 %, to the power 1/6; the radius is taken on these frames.
+        """Return the region's mean volume at 90 %, to the power 1/6, calibrated on these frames.
 
         Condition (n, components + 6) and scaled residuals (n, 6).
         """
@@ -181,7 +180,7 @@ class RegionLearner(Learner):
 class McqrHead(ExportedHead):
     """Features -> pose (n, 7), codebook (n, J, 6) and scale (n, 6, 6), in metres and radians.
 
-    Both in the chart about the prediction: codebook points are (t_hat, 0) + e.
+    Codebook and scale are in the chart centred at the prediction: points are (t_hat, 0) + e.
     """
 
     output_names = ("pose", "codebook", "scale")
@@ -210,7 +209,7 @@ class McqrHead(ExportedHead):
             ("points", points),
         ):
             self.register_buffer(name, values)
-        # Of the predicted position alone: a prediction's own rotation numbers are zero.
+        # Position only: in its own tangent chart, the prediction's rotation is zero.
         self.register_buffer("origin", torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
         self.components: Tensor
         self.unit: Tensor
@@ -233,11 +232,11 @@ class McqrHead(ExportedHead):
         return self.decoder.pose(coordinates), codebook, scale
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """As for CQR; of the six intervals alone."""
+        """Return the candidates of CQR; they apply to the six marginal intervals only."""
         return interval_candidates(self._method_parameters)
 
     def choices(self) -> Mapping[str, float]:
-        """Inflation of the region, and how many points of its codebook stayed."""
+        """Return the region's inflation and the number of codebook points kept."""
         return {"kappa": float(self.kappa), "points": len(self.points)}
 
 
@@ -294,7 +293,7 @@ def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
 
 
 def _choice(learner: RegionLearner, examples: Examples, config: McqrConfig, seed: int) -> Choice:
-    """Return inflation and points of the codebook, on val and a sample of the training rows."""
+    """Choose inflation and codebook points on val and a sample of the training rows."""
     generator = np.random.default_rng(seed)
     copy = generator.integers(len(examples.x), size=_USAGE_ROWS)
     row = generator.integers(examples.x.shape[1], size=_USAGE_ROWS)

@@ -1,4 +1,4 @@
-"""The point network: features -> one pose, and what its errors are on frames it has not seen."""
+"""The point network: features -> one pose, and its residuals on frames it has not seen."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Residuals = Annotated[
         "cross_fitted below 1500 training frames."
     ),
 ]
-# Fields that the options of several methods share.
+# Fields shared by the options of several methods.
 COMPONENTS = "Principal components of the features that the model sees besides the point."
 Hidden = Annotated[tuple[int, int], Meta(description="Widths of the two hidden layers.")]
 FeatureNoise = Annotated[
@@ -40,7 +40,7 @@ FeatureNoise = Annotated[
     Meta(ge=0, description="Deviation of the noise added to the features while training."),
 ]
 
-# Fewer training frames than this are too few to set a part aside for models of residuals.
+# With fewer training frames, too few remain if some are set aside for the residual models.
 _MANY_FRAMES = 1500
 _FOLDS = 3
 _LEAST_DEVIATION = 1e-6
@@ -66,10 +66,10 @@ class PointNetwork(nn.Module):
         return point
 
     def passes(self, features: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        """Features (n, size) -> stochastic passes with the dropout of training, (count, n, 6).
+        """Features (n, size) -> stochastic passes with training dropout, (count, n, 6).
 
-        MC-dropout (Gal and Ghahramani 2016) behind the last hidden layer; all before it is computed
-        once.
+        MC-dropout (Gal and Ghahramani 2016) after the last hidden layer; the layers before it are
+        computed once.
         """
         *trunk, last = (layer for layer in self.layers if not isinstance(layer, nn.Dropout))
         hidden = self.standardise(features)
@@ -82,7 +82,7 @@ class PointNetwork(nn.Module):
 
 
 class PointLearner(Learner):
-    """The point network with the mean absolute error: the centre of an interval is a median."""
+    """The point network with mean absolute error, so that it predicts the median."""
 
     def __init__(
         self, size: int, hidden: tuple[int, int], feature_noise: float, dropout: float = 0.0
@@ -97,22 +97,22 @@ class PointLearner(Learner):
         return error.abs().mean()
 
     def val_score(self, features: Tensor, y: Array) -> float:
-        """As ``Learner``; of intervals of one width about the point."""
+        """See ``Learner``; scores intervals of constant width about the point."""
         point = self.network(features).double().numpy()
         return conformalised_score(point, point, y)
 
 
 class HeldOut(NamedTuple):
-    """A point network, and networks that have not seen the frames whose residuals count.
+    """A point network, and networks that predict frames they were not trained on.
 
     Attributes
     ----------
     network
-        The one that is shipped.
+        The network that is exported.
     rows
-        Training images, as rows of the lessons, that have a network which has not seen them.
+        Training images (rows of the lessons) for which a network that has not seen them exists.
     parts
-        Such rows, and their network.
+        Rows, each with the network that has not seen them.
     """
 
     network: PointNetwork
@@ -148,11 +148,11 @@ def learn_held_out(
     feature_noise: float,
     dropout: float = 0.0,
 ) -> HeldOut:
-    """Train the point network, and those of the other folds where residuals are cross-fitted.
+    """Train the point network and, for cross-fitted residuals, a network per fold.
 
-    ``held_out``: the network learns from the role train, residuals are those of fit. ``auto``:
-    cross-fitted below 1500 training frames. Raises UsageError for cross-fitted residuals with a
-    backbone that learns, too: it has seen all frames.
+    ``held_out``: the network learns from the role train; residuals come from the role fit.
+    ``auto``: cross-fitted below 1500 training frames. Raises UsageError for cross-fitted residuals
+    with a fine-tuned backbone, which has seen all frames.
     """
     everything = np.arange(lessons.n_images)
     cross_fitted = residuals == "cross_fitted"
@@ -160,7 +160,7 @@ def learn_held_out(
         cross_fitted = not lessons.fine_tuned and everything.size < _MANY_FRAMES
     if cross_fitted and lessons.fine_tuned:
         raise UsageError(
-            "residuals: expected held_out with a backbone that learns, too, found cross_fitted"
+            "residuals: cross_fitted needs a frozen backbone; use held_out with --fine-tune"
         )
 
     def learn(lesson: str, rows: Indices, candidate: bool = True) -> PointNetwork:
@@ -186,7 +186,7 @@ def learn_held_out(
 def residuals_of(setting: Setting, point: Array, poses: Array) -> Array:
     """Standardised points (..., 6), true poses (..., 7) -> (t - t_hat, Log(R_hat^T R)), (..., 6).
 
-    In metres and radians, the chart ``tangent_predicted`` less the prediction's own place in it.
+    In metres and radians: the chart ``tangent_predicted`` relative to the prediction's coordinates.
     """
     decoder = PoseDecoder(setting.target)
     flat = torch.from_numpy(point.reshape(-1, DOF)).float()
@@ -198,7 +198,7 @@ def residuals_of(setting: Setting, point: Array, poses: Array) -> Array:
 
 
 def check_components(lessons: Lessons, count: int) -> None:
-    """Raise UsageError where there are not so many principal components; before any lesson."""
+    """Raise UsageError if the lessons yield fewer than ``count`` principal components."""
     most = min(lessons.n_images, lessons.setting.feature_size)
     if count > most:
         raise UsageError(
@@ -208,9 +208,9 @@ def check_components(lessons: Lessons, count: int) -> None:
 
 
 def deviation_of(residual: Array) -> Array:
-    """Residuals (..., 6) -> 1.4826 times the median distance from the median: a Gaussian's sigma.
+    """Residuals (..., 6) -> robust standard deviation per DoF, (6,), at least 1e-6.
 
-    Shape (6,), at least 1e-6.
+    1.4826 times the median absolute deviation, which equals sigma for a Gaussian.
     """
     flat = residual.reshape(-1, DOF)
     spread = np.median(np.abs(flat - np.median(flat, axis=0)), axis=0)
@@ -220,7 +220,7 @@ def deviation_of(residual: Array) -> Array:
 def principal_components(
     network: PointNetwork, features: NDArray[np.float16], count: int
 ) -> Tensor:
-    """Features (n, size) -> directions of the greatest spread, standardised, (size, count)."""
+    """Features (n, size) -> principal components of the standardised features, (size, count)."""
     with torch.no_grad():
         x = network.standardise(torch.from_numpy(features).float()).double()
     _, _, directions = torch.linalg.svd(x - x.mean(dim=0), full_matrices=False)
