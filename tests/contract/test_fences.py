@@ -76,3 +76,13 @@ def test_each_error_has_its_documented_exit_code(name, code):
     assert error.exit_code == code
     assert name in cvo_edge.__all__
     assert f"{name} " in (errors.__doc__ or "")
+
+
+def test_importing_either_command_line_leaves_the_environment_alone():
+    pytest.importorskip("cvo_export")
+    code = (
+        "import os\nbefore = dict(os.environ)\n"
+        "import cvo_edge.programs.cli, cvo_edge.process, cvo_export.cli\n"
+        "assert dict(os.environ) == before, set(os.environ) ^ set(before)"
+    )
+    fresh_process(code)
