@@ -1,4 +1,4 @@
-"""Shared fixtures: the demonstration bundle, its clip, and real data where CVO_DATA names it."""
+"""Shared fixtures: the demonstration bundle, its clip, and real data if CVO_DATA is set."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.vocabulary import Joint, Scope
 
-# Shared machines are slow now and then: a law that holds late still holds.
+# No deadline: shared machines are slow at times, and a slow pass is still a pass.
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
@@ -31,7 +31,7 @@ ARTIFACTS = ROOT / "calibration_artifacts"
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_model_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep the commands that tests run away from the user's cache of prepared models."""
+    """Keep commands run by tests away from the user's model cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CVO_EDGE_CACHE", str(tmp_path_factory.mktemp("models")))
         yield
@@ -39,7 +39,7 @@ def _own_model_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 
 @pytest.fixture
 def files_limited() -> Callable[[int], AbstractContextManager[None]]:
-    """Limit the bytes of each file that this process writes, as a disk that fills up does."""
+    """Limit the size of each file that this process writes, like a full disk."""
 
     @contextmanager
     def limited(limit: int) -> Iterator[None]:
@@ -77,13 +77,13 @@ def bundle(bundle_dir: Path) -> Bundle:
 
 @pytest.fixture
 def copied_bundle(bundle_dir: Path, tmp_path: Path) -> Path:
-    """A copy of the demonstration bundle that a test may damage."""
+    """A copy of the demonstration bundle that tests may damage."""
     return Path(shutil.copytree(bundle_dir, tmp_path / "bundle"))
 
 
 @pytest.fixture
 def rewrite(copied_bundle: Path) -> Callable[[Calibration], Path]:
-    """Write another calibration into the copied bundle, with its digest made to fit."""
+    """Write another calibration into the copied bundle, with a matching digest."""
 
     def write(calibration: Calibration) -> Path:
         content = encode_calibration(calibration)
@@ -95,7 +95,7 @@ def rewrite(copied_bundle: Path) -> Callable[[Calibration], Path]:
 
 @pytest.fixture(scope="session")
 def make_head(bundle: Bundle) -> Callable[..., Head]:
-    """Head of a method with these parameters, score and thresholds at 0.9."""
+    """Build a method's head with these parameters, score and thresholds at 0.9."""
 
     def make(
         method: str,
@@ -117,7 +117,7 @@ def make_head(bundle: Bundle) -> Callable[..., Head]:
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder with real recordings; skips visibly without it."""
+    """The folder with real recordings; skips the test if CVO_DATA is not set."""
     folder = os.environ.get("CVO_DATA")
     if not folder:
         pytest.skip("CVO_DATA is not set: no real data")

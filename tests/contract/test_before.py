@@ -1,4 +1,4 @@
-"""Bundles of the first format are read with the numbers that they were published with.
+"""Bundles of the first format yield the numbers they were published with.
 
 ``data/before_0.1.json`` holds thresholds and estimates of the four demonstration bundles on the
 first frames of the demonstration clip, computed by the code that published them.
@@ -13,7 +13,7 @@ import pytest
 from cvo_edge import Odometer, open_source, read_bundle
 
 BEFORE = json.loads((Path(__file__).parent / "data/before_0.1.json").read_bytes())
-# Kernels of another processor round differently; a wrong rule would be off by much more.
+# Kernels of other processors round differently; a wrong rule would be off by far more.
 TOLERANCE = 1e-4
 
 

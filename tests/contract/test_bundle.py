@@ -1,4 +1,4 @@
-"""The bundle: round trip, and refusals on exact bytes."""
+"""The bundle: round trip, and rejection of invalid bytes."""
 
 import hashlib
 import json
@@ -19,7 +19,7 @@ from cvo_edge.engine.loading import read_bundle
 
 
 def redigested(document):
-    """Bytes of a document with its digest made to fit, as an attacker or a bug would write it."""
+    """Encode a document with a matching digest, as an attacker or a bug could."""
     document = {**document, "digest": "0" * 64}
     content = json.dumps(document).encode("utf-8")
     return content.replace(b"0" * 64, hashlib.sha256(content).hexdigest().encode())
@@ -50,7 +50,7 @@ def test_redigesting_the_same_document_is_accepted(document):
 
 
 def replaced(document, path, value):
-    """A deep copy of the document with one value replaced; ``...`` deletes the key."""
+    """Return a deep copy of the document with one value replaced; ``...`` deletes the key."""
     copy = json.loads(json.dumps(document))
     *parents, last = path
     node = copy
@@ -174,7 +174,7 @@ def test_tensors_that_the_method_does_not_work_with_are_refused_at_load(
 
 
 def with_joint_at(document, confidence, values):
-    """The document with these q_hat of the joint scope at this confidence and below."""
+    """Return the document with these joint q_hat at this confidence and below."""
     copy = json.loads(json.dumps(document))
     for entry in copy["thresholds"]:
         if entry["scope"] == "joint" and entry["confidence"] <= confidence:
@@ -212,7 +212,7 @@ def test_of_two_sides_each_has_half_of_what_the_joint_scope_may_miss(tmp_path, a
     document["method_parameters"]["sides"] = "asymmetric"
     for entry in document["thresholds"]:
         entry["q_hat_upper"] = entry["q_hat"]
-    # A side at 0.8 holds with 0.9, as each of them does in a joint scope at 0.9.
+    # At 0.8 marginal, each side covers 0.9, which a joint scope at 0.9 requires of every side.
     least = marginal_at(document, 0.8)
     (folder / "calibration.json").write_bytes(redigested(with_joint_at(document, 0.9, least)))
     Odometer.load(folder).close()
@@ -296,7 +296,7 @@ def test_no_mutated_byte_is_accepted(content, data):
         decode_calibration(content[:position] + bytes([value]) + content[position + 1 :])
 
 
-# What JSON can hold, numbers that floats cannot tell apart and words that only look like numbers.
+# All JSON values, including numbers that floats cannot distinguish and numeric-looking text.
 json_values = st.recursive(
     st.none()
     | st.booleans()
@@ -322,7 +322,7 @@ def places(node, path=()):
 
 
 def same(one, other):
-    """Whether two documents say the same, 1 and 1.0 alike, but not 1 and True."""
+    """Whether two documents are equal: 1 equals 1.0, but not True."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
     if isinstance(one, list) and isinstance(other, list):

@@ -1,4 +1,4 @@
-"""The command line as a user runs it: records, gates, exit codes, signals."""
+"""The command line from a user's view: records, gates, exit codes, signals."""
 
 import fcntl
 import json
@@ -19,7 +19,7 @@ import pytest
 from cvo_edge import Odometer, open_source, read_records
 
 CVO_EDGE = [sys.executable, "-c", "from cvo_edge.__main__ import main; main()"]
-# Whoever runs the suite in the background of a script has it ignore SIGINT, and its children too.
+# A script that runs the tests in the background makes their processes ignore SIGINT.
 FOREGROUND = [
     sys.executable,
     "-c",
@@ -34,7 +34,7 @@ def cvo_edge(*arguments, **options):
 
 
 def refused(result, code):
-    """One line on stderr, the documented code, no traceback."""
+    """Check for one line on stderr, the documented code, and no traceback."""
     assert result.returncode == code, result.stderr
     lines = result.stderr.strip().splitlines()
     assert len(lines) == 1, result.stderr
@@ -43,7 +43,7 @@ def refused(result, code):
 
 
 def records_in(output):
-    """Decoded JSON lines of a run, its header left out."""
+    """Decoded JSON lines of a run, without its header."""
     header, *records = map(json.loads, output.splitlines())
     assert header["kind"] == "header"
     return records
@@ -122,13 +122,13 @@ def test_a_reader_that_leaves_ends_it_quietly(bundle_dir, clip_dir):
 
 @pytest.mark.parametrize("delay_s", [0.1, 0.2, 0.25, 0.3, 0.35, 0.5])
 def test_a_signal_while_it_starts_is_no_defect(bundle_dir, delay_s):
-    """Modules that are being initialised turn what a signal raises into errors of their own."""
+    """A signal during an import surfaces as another error of the imported module."""
     command = [*FOREGROUND, "bench", str(bundle_dir), "--frames", "1000000"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         time.sleep(delay_s)
         process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=60)
-    # Before the first line of ours Python ends as it does without us.
+    # Before our code runs, Python's default action applies.
     assert process.returncode in (143, -signal.SIGTERM)
     assert said == ""
 
@@ -138,7 +138,7 @@ def test_a_signal_while_it_starts_is_no_defect(bundle_dir, delay_s):
 def test_a_signal_ends_it_with_every_record_whole(
     bundle_dir, clip_dir, tmp_path, number, code, mode
 ):
-    # Links to one image make a source that is long enough to be interrupted.
+    # Links to one image make a source long enough to be interrupted.
     image = next(iter(sorted(clip_dir.glob("*.color.jpg"))))
     frames = tmp_path / "frames"
     frames.mkdir()
@@ -162,7 +162,7 @@ def test_a_signal_ends_it_with_every_record_whole(
     content = out.read_text()
     assert content.endswith("\n")
     sequence = [record["seq"] for record in records_in(content)]
-    if mode == "live":  # what the network was too slow for is missing
+    if mode == "live":  # frames are dropped while the network is busy
         assert sequence == sorted(set(sequence))
     else:
         assert sequence == list(range(len(sequence)))
@@ -186,7 +186,7 @@ def test_killed_without_warning_loses_no_acknowledged_record(bundle_dir, clip_di
 def test_a_disk_that_fills_up_within_a_line_keeps_every_line_before_it_and_no_part_of_it(
     bundle_dir, clip_dir, tmp_path, format
 ):
-    # So that ever another byte of a line is the first that does not fit.
+    # The limits cut lines at different bytes.
     for limit in (2500, 2501, 2550):
         output = tmp_path / f"records-{limit}"
 
@@ -496,7 +496,7 @@ def test_the_exit_code_is_the_same_where_nobody_reads_stderr(bundle_dir, clip_di
         )
     os.close(sender)
     assert done.returncode == code
-    # Nor does what was meant for it go among the records.
+    # Messages for stderr do not end up among the records either.
     assert all(json.loads(line)["seq"] >= 0 for line in done.stdout.splitlines()[1:])
 
 
@@ -566,7 +566,7 @@ def test_verify_needs_none_of_the_first_three_files(bundle_dir):
 def test_what_libraries_print_is_not_among_ours(bundle_dir, clip_dir, tmp_path):
     image = min(clip_dir.glob("*.jpg")).read_bytes()
     place = len(image) // 2
-    # libjpeg says so at length, and decodes on.
+    # libjpeg prints warnings and continues to decode.
     (tmp_path / "0.jpg").write_bytes(image[:place] + image[-2:])
     (tmp_path / "1.jpg").write_bytes(image)
     result = cvo_edge("run", bundle_dir, tmp_path, "--quiet")
@@ -575,7 +575,7 @@ def test_what_libraries_print_is_not_among_ours(bundle_dir, clip_dir, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_where_no_python_runs(bundle_dir, tmp_path, number):
-    """A picture that takes minutes to decode, by a library that knows no signals."""
+    """The picture takes minutes to decode, in a library that does not handle signals."""
     jpeg = cv2.imencode(
         ".jpg", np.zeros((8000, 8000, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
     )[1].tobytes()

@@ -1,4 +1,4 @@
-"""The demonstration bundles: each runs here, as it ran where it was made."""
+"""The demonstration bundles: each runs here as it did where it was made."""
 
 import json
 from pathlib import Path
@@ -51,7 +51,7 @@ def test_it_is_small_enough_for_a_repository(demonstration):
 @pytest.mark.whole_clip
 @pytest.mark.parametrize("scope", ["marginal", "joint"])
 def test_the_clip_is_covered_about_as_often_as_stated(demonstration, clip_dir, scope):
-    # A new flight of the scene that was trained on: far from exact theory, near the number.
+    # A new flight of the training scene: exchangeability does not hold, coverage is only close.
     truth = open_ground_truth(clip_dir)
     with Odometer.load(demonstration, scope=scope) as odometer:
         estimates = list(odometer.stream(open_source(str(clip_dir))))

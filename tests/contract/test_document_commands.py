@@ -1,8 +1,8 @@
-"""Every command and every Python example in the documents does what a reader expects: it runs.
+"""Every command and every Python example in the documents runs.
 
 An HTML comment before a fenced block gives its class: ``<!-- test: run -->`` (run with the
 demonstration bundle and clip), ``<!-- test: train -->`` (run on a tiny rendered data set) or
-``<!-- test: parse -->`` (programs, commands and options are checked, nothing is run).
+``<!-- test: parse -->`` (only programs, commands and options are checked).
 """
 
 import re
@@ -33,7 +33,7 @@ PAGES = sorted(
 SHELLS, CLASSES = ("sh", "console", "bash", "shell"), ("run", "train", "parse")
 COMMANDS = {"cvo-edge": get_command(edge_app), "cvo-export": get_command(export_app)}
 OTHERS = ("openssl", "ray", "git")
-# Options that make a command small; the last one of a name counts.
+# Options that reduce a command's work; the last occurrence of an option counts.
 SMALL = {
     ("cvo-edge", "run"): ["--max-frames", "4"],
     ("cvo-edge", "bench"): ["--frames", "5", "--warmup", "1"],
@@ -64,7 +64,7 @@ class Block:
 
 @cache
 def blocks(page: str) -> list[Block]:
-    """Return the fenced blocks of a page; the class is that of the last line before the fence."""
+    """Return the fenced blocks of a page; the line before the fence gives the class."""
     found, before, opened = [], "", None
     for number, line in enumerate((ROOT / page).read_text("utf-8").splitlines(), start=1):
         fence = re.match(r"\s*```(\w*)", line)
@@ -91,7 +91,7 @@ def without_environment(words: list[str]) -> tuple[dict[str, str], list[str]]:
 
 
 def parse(words: list[str]) -> None:
-    """Raise where a command would not be understood."""
+    """Raise an error if a command line is invalid."""
     program, *rest = without_environment(words)[1]
     if program in COMMANDS:
         parse_own(program, rest)
@@ -127,7 +127,7 @@ def check_extras(wanted: str) -> None:
 
 
 def execute(page: str, kind: str, monkeypatch: pytest.MonkeyPatch, done: list[list[str]]) -> None:
-    """Run the blocks of one class, in their order, in the working folder; what is done once."""
+    """Run a page's blocks of one class in order; skip commands that are in ``done``."""
     for block in blocks(page):
         if block.kind != kind:
             continue
@@ -160,7 +160,7 @@ def check_left(leaving: typer.Exit, words: list[str]) -> None:
 
 @pytest.fixture
 def stage(tmp_path, monkeypatch, artifacts_dir) -> None:
-    """A folder in which the names that documents use are those of real files."""
+    """A folder in which the names used in documents are real files."""
     furnish(tmp_path, artifacts_dir)
     monkeypatch.setenv("CVO_EDGE_CACHE", str(tmp_path / "models"))
     monkeypatch.chdir(tmp_path)
@@ -174,7 +174,7 @@ class Workshop:
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory, artifacts_dir) -> Workshop:
-    """A folder with a recorded kitchen, an office, a network of one's own and a trained bundle."""
+    """A folder with two recorded scenes, a user's own network and a trained bundle."""
     folder = tmp_path_factory.mktemp("workshop")
     furnish(folder, artifacts_dir)
     flights = open_dataset(SCENE)
@@ -211,7 +211,7 @@ def test_every_block_of_commands_says_how_it_is_tested() -> None:
 def test_no_command_hides_from_the_test() -> None:
     for page in PAGES:
         text = (ROOT / page).read_text("utf-8")
-        # Recorded commands stand in generated tables; they were run.
+        # Skip recorded commands in generated tables; they did run.
         text = re.sub(r"(?s)<!-- table: .*?<!-- end table -->", "", text)
         for number, line in enumerate(text.splitlines(), start=1):
             hidden = re.match(r" {4,}(cvo-edge|cvo-export|make|pip) [a-z]", line)

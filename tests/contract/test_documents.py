@@ -1,4 +1,4 @@
-"""Documents explain every reason and exit code, and every program has left its results."""
+"""Documents explain every reason and exit code, and every program has stored results."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Fences: what the runtime may import, what it exposes, what each error returns."""
+"""Boundaries: permitted imports of the runtime, its public names, and codes of its errors."""
 
 import subprocess
 import sys

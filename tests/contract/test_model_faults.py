@@ -1,4 +1,4 @@
-"""What the network may give and what becomes of it, by small models made for the purpose."""
+"""Possible model outputs and their consequences, tested with small purpose-built models."""
 
 import hashlib
 
@@ -17,7 +17,7 @@ onnx = pytest.importorskip("onnx")
 
 
 def constant_model(pose, lower, upper, height=192, width=256):
-    """A model that answers the same to every image (times zero of it, so that it is used)."""
+    """A model with constant outputs; it adds zero times the image so that the input is used."""
     helper = onnx.helper
     outputs = {"pose": pose, "lower": lower, "upper": upper}
     nodes = [
@@ -130,7 +130,7 @@ def test_steep_pitch_is_defined_and_told_of_where_angles_are_euler(bundle, degre
     found = step(bundle, pose=[0.0, 0.0, 0.0, *quaternion], rotation="euler_zyx")
     assert found.status is Status.OK
     assert found.reasons == ((Reason.PITCH_NEAR_90,) if abs(degrees) > 80.0 else ())
-    # Of the angles that mean this rotation one triple is taken, and means it still.
+    # Several triples of angles represent this rotation; the chosen one must, too.
     again = euler_zyx_to_quaternion(found.chart.point(found.pose.to_array())[3:])
     assert abs(again @ quaternion) == pytest.approx(1.0, abs=1e-6)
 
@@ -174,7 +174,7 @@ def test_a_quaternion_of_any_length_and_sign_is_the_same_rotation(bundle):
 
 @pytest.mark.parametrize("found", [1, 3, 6])
 def test_an_output_of_another_shape_than_declared_fails(bundle, found):
-    """Only where it runs can be seen what a model gives: its end of a slice is a number."""
+    """The output's shape is known only at run time: the end of a slice is a computed number."""
     model = onnx.load_from_string(constant_model(IDENTITY, (-1.0,) * 6, (1.0,) * 6))
     graph, helper = model.graph, onnx.helper
     (add,) = [node for node in graph.node if list(node.output) == ["lower"]]

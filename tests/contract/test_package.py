@@ -1,4 +1,4 @@
-"""Both packages: what their metadata promises, and the versions that constraints/ pins."""
+"""Both packages: their metadata, and the versions that constraints/ pins."""
 
 import re
 import tomllib

@@ -1,4 +1,4 @@
-"""Tables in the documents come from result files, and result files say how they came about."""
+"""Tables in documents come from result files, and result files record their origin."""
 
 import json
 import re
@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "bench" / "results"
-# Fills the text of standard input.
+# Fills the tables in the text on standard input.
 FILL = "import sys, tables; print(tables.filled(sys.stdin.read(), 'page'), end='')"
 
 

@@ -1,4 +1,4 @@
-"""Models that a digest cannot tell from good ones: ``verify`` ends, and says what they did."""
+"""Models that a matching digest does not make safe: ``verify`` terminates and reports them."""
 
 import hashlib
 import math
@@ -25,7 +25,7 @@ RUN = "from cvo_edge.__main__ import main; main()"
 
 
 def model_with(pieces, constants, bundle):
-    """A model whose outputs of the demonstration depend on ``huge``, which the pieces compute."""
+    """A model whose outputs depend on ``huge``, which the pieces compute."""
     helper, proto = onnx.helper, onnx.TensorProto
     nodes = [
         helper.make_node("Cast", ["image"], ["real"], to=proto.FLOAT),
@@ -46,7 +46,7 @@ def model_with(pieces, constants, bundle):
 
 
 def endless(bundle):
-    """A loop of 2^62 turns, a few hundred bytes."""
+    """A loop of 2^62 iterations, in a few hundred bytes."""
     helper, proto = onnx.helper, onnx.TensorProto
     body = helper.make_graph(
         [
@@ -73,7 +73,7 @@ def endless(bundle):
 
 
 def enormous(bundle):
-    """3 GiB of zeros, which the machine would give, in a few hundred bytes."""
+    """3 GiB of zeros, which the machine could allocate, in a few hundred bytes."""
     helper, proto = onnx.helper, onnx.TensorProto
     constants = [onnx.numpy_helper.from_array(np.array([3 * 2**28]), "elements")]
     pieces = [
@@ -87,19 +87,19 @@ def enormous(bundle):
 
 
 def different(bundle):
-    """A model that loads and answers, something else."""
+    """A model that loads and yields other outputs."""
     pieces = [onnx.helper.make_node("Identity", ["least"], ["huge"])]
     return model_with(pieces, [], bundle)
 
 
 def damaged(bundle):
-    """Half of the model."""
+    """Half of the model's bytes."""
     return bundle.model_bytes[: len(bundle.model_bytes) // 2]
 
 
 @pytest.fixture
 def with_model(copied_bundle, rewrite, bundle):
-    """Put a model into the copied bundle, all digests made to fit."""
+    """Put a model into the copied bundle and update all digests."""
 
     def put(content):
         (copied_bundle / MODEL_FILE).write_bytes(content)
@@ -130,7 +130,7 @@ def test_whatever_the_model_does_verify_ends_and_says_so(with_model, bundle, mak
 def test_a_model_that_reaches_for_files_is_refused(
     with_model, copied_bundle, rewrite, bundle, tmp_path, monkeypatch, provider
 ):
-    """Whoever writes a folder that the program is started in would change what is signed."""
+    """Otherwise, write access to the working folder would suffice to change a signed model."""
     if provider == "openvino":
         pytest.importorskip("openvino")
     model = onnx.load_from_string(bundle.model_bytes)
@@ -192,7 +192,7 @@ def test_many_threads_have_room_for_their_stacks(bundle_dir):
 
 
 def test_what_is_said_has_a_bound(rewrite, bundle):
-    """An answer longer than a pipe would have its process wait for a reader."""
+    """A message longer than a pipe's buffer would block the process until it is read."""
     model = bundle.calibration.model
     more = tuple(
         msgspec.structs.replace(model.outputs[0], name="\U0001f600" * 190 + str(number))

@@ -1,4 +1,4 @@
-"""A clock whose time a test sets."""
+"""A simulated clock for tests."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cvo_edge.input.clock import Clock
 
 
 class SimulatedClock(Clock):
-    """Time passes only when a test, or a wait on this clock, lets it pass."""
+    """A clock that advances only when a test, or a wait on this clock, advances it."""
 
     def __init__(self) -> None:
         self.now = self.busy = self.suspended = 0.0

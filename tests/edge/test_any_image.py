@@ -1,4 +1,4 @@
-"""Any input as an image gives a defined conversion, or an estimate that says what is wrong."""
+"""Any image array yields a defined conversion, or an estimate that names the problem."""
 
 from collections import Counter
 
@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import array_shapes, arrays, scalar_dtypes
 
 from cvo_edge import Frame, Odometer, Status, open_source
 
-# Arrays of any type and shape, and images as cameras give them.
+# Arrays of any type and shape, and typical camera images.
 anything = arrays(scalar_dtypes(), array_shapes(min_dims=0, max_dims=4, max_side=24))
 images = st.one_of(
     arrays(
@@ -37,7 +37,7 @@ def scene(clip_dir):
 
 
 def one_of_a_scene(data, scene):
-    """A good image in another form: grey, with alpha, in 16 bits, cut, turned, blown out."""
+    """Convert a good image: grey, with alpha, 16-bit, cropped, rotated or overexposed."""
     image = data.draw(st.sampled_from(scene))
     return data.draw(
         st.sampled_from(
@@ -68,7 +68,7 @@ def test_an_interval_is_finite_only_without_a_reason_against_it(odometer, scene)
             "image": lambda: data.draw(images),
             "scene": lambda: one_of_a_scene(data, scene),
         }[kind]()
-        # In a stream of its own, no earlier frame speaks against it.
+        # A new stream has no earlier frame to compare with.
         (estimate,) = odometer.stream([Frame(image, stamp_ns, "", 0.0)])
         seen[estimate.status] += 1
         finite = np.isfinite([*estimate.lower, *estimate.upper])
@@ -78,7 +78,7 @@ def test_an_interval_is_finite_only_without_a_reason_against_it(odometer, scene)
         assert (estimate.pose is None) == (estimate.status is Status.INVALID)
 
     law()
-    # Degraded estimates are rare: odd images seldom have a plausible pose.
+    # Degraded estimates are rare: distorted images seldom yield a plausible pose.
     assert min(seen[Status.OK], seen[Status.INVALID]) > 50, seen
 
 

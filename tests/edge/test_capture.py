@@ -1,4 +1,4 @@
-"""Cameras that end, hang and come back: on simulated time, and over loopback and pipes."""
+"""Cameras that end, hang and reconnect: on simulated time, and over loopback and pipes."""
 
 import contextlib
 import http.server
@@ -21,9 +21,9 @@ from cvo_edge import SourceError, UsageError, open_source
 from cvo_edge.input.capture import READER, Capture, Grabbed, shown
 from cvo_edge.input.sources import PAUSES_S, Camera
 
-# Only a defect lets a wait last so long.
+# Only a defect makes a wait take this long.
 HANGS_S = 120.0
-# A background shell may let its children ignore SIGINT. Attempts follow without pauses.
+# In a background shell, children may ignore SIGINT. Attempts follow without pauses.
 RUN = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     "import cvo_edge.input.sources as sources; sources.PAUSES_S = (0.01,) * 5; "
@@ -35,11 +35,11 @@ IMAGE = np.zeros((4, 4, 3), np.uint8)
 
 
 class Cameras:
-    """Cameras on simulated time; ``lives`` says what each connection to one gives.
+    """Cameras on simulated time; ``lives`` describes what each connection to one yields.
 
-    A life is a list of seconds until the next frame, ``None`` for a frame that does not decode,
-    and a SourceError to raise; it begins with an error if the camera does not open, and the stream
-    ends behind it.
+    A life is a list: seconds until the next frame, ``None`` for a frame that does not decode, or a
+    SourceError to raise. It starts with an error if the camera does not open; the stream ends after
+    the last item.
     """
 
     def __init__(self, clock, *lives):
@@ -170,7 +170,7 @@ def test_stop_ends_the_pause_before_a_new_attempt(clock):
 
 
 class Answers(SimpleQueue):
-    """Answers that come after some waits have expired, as when this process was stopped."""
+    """Answers that arrive after some waits have expired, as in a process that was suspended."""
 
     def __init__(self, expired):
         self.expired, self.waits_s = expired, []
@@ -183,7 +183,7 @@ class Answers(SimpleQueue):
 
 
 def test_time_in_which_the_process_was_stopped_is_not_waited_time():
-    """One part of the wait expires then, however long the process was stopped."""
+    """A suspension, however long, lets only one part of the wait expire."""
     capture = Capture("nothing", 5.0)
     capture._answers = Answers(expired=1)
     assert capture.read() is None
@@ -197,7 +197,7 @@ def test_time_in_which_the_process_was_stopped_is_not_waited_time():
 
 
 class NetworkCamera:
-    """Motion JPEG over HTTP on loopback, as fast as it is read.
+    """Motion JPEG over HTTP on loopback, sent as fast as the client reads it.
 
     ``lives`` holds the number of frames of each connection; the last connection then hangs.
     """
@@ -232,7 +232,7 @@ class NetworkCamera:
         self.serving.start()
 
     def close(self):
-        """End all connections, and wait for their threads."""
+        """Close all connections and join their threads."""
         self.stopped.set()
         self.server.shutdown()
         self.server.server_close()
@@ -255,7 +255,7 @@ def network_camera(clip_dir):
 
 @pytest.fixture
 def hasty(monkeypatch):
-    """Attempts without pauses between them."""
+    """Remove the pauses between attempts."""
     monkeypatch.setattr("cvo_edge.input.sources.PAUSES_S", (0.01,) * len(PAUSES_S))
 
 
@@ -303,7 +303,7 @@ def test_abandoned_connections_leave_neither_threads_nor_files(network_camera, h
 
 
 def test_a_camera_that_never_answers_is_given_up(bundle_dir, tmp_path):
-    """In a process of its own: OpenCV opens one stream at a time, and this one never opens."""
+    """Runs in its own process: OpenCV opens one stream at a time, and this one never opens."""
     pipe = tmp_path / "camera"
     os.mkfifo(pipe)
     arguments = ["run", bundle_dir, pipe, "--timeout", "0.1"]
@@ -341,7 +341,7 @@ def test_a_signal_ends_a_run_whose_read_does_not_return(network_camera, bundle_d
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        # The last frame that arrives is never dropped; behind it, the camera hangs.
+        # The last frame is never dropped; after it, the camera hangs.
         while json.loads(process.stdout.readline()).get("seq", -1) < 13:
             pass
         process.send_signal(number)

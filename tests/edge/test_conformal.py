@@ -1,4 +1,4 @@
-"""The rank rule and its relatives against closed forms."""
+"""The rank rule and related functions against closed forms."""
 
 import math
 
@@ -64,7 +64,7 @@ def test_hierarchical_needs_nine_sequences_at_ninety_percent(sequences, bounded)
 
 
 def test_hierarchical_weighs_sequences_not_frames():
-    # One long sequence of small scores must not drown nine short ones of large scores.
+    # One long sequence of small scores must not dominate nine short ones of large scores.
     values = np.concatenate([np.zeros(1000), np.ones(9)])
     sequence = np.concatenate([np.zeros(1000), np.arange(1, 10)])
     assert hierarchical_quantile(values, sequence, 0.8) == 1.0

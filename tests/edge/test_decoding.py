@@ -1,4 +1,4 @@
-"""Image files: whole or not at all, their size known before they are decoded, one meaning each."""
+"""Image files: decoded completely or not at all, with the size known before decoding."""
 
 import hashlib
 import os
@@ -21,7 +21,7 @@ SUFFIXES = (".jpg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".webp")
 
 
 def picture(height=48, width=64, seed=0):
-    """Smooth with some noise, uint8 BGR."""
+    """Return a smooth image with some noise, uint8 BGR."""
     noise = np.random.default_rng(seed).integers(0, 40, (height, width, 3))
     ramp = np.linspace(0, 200, width)[None, :, None]
     return (noise + ramp).astype(np.uint8)
@@ -34,7 +34,7 @@ def encoded(suffix, image):
 
 
 def bomb(side=32000):
-    """A PNG of one bit a pixel, 130 kB that would become gigabytes."""
+    """Return a 1-bit PNG of 130 kB that would decode to gigabytes."""
 
     def chunk(name, data):
         checked = name + data
@@ -48,7 +48,7 @@ def bomb(side=32000):
 
 
 def with_orientation(jpeg, orientation):
-    """The JPEG with an EXIF segment that asks for a rotation."""
+    """Add an EXIF segment that requests a rotation to the JPEG."""
     tiff = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
     data = b"Exif\0\0" + tiff
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(data) + 2) + data + jpeg[2:]
@@ -75,7 +75,7 @@ def test_a_thumbnail_does_not_end_a_cut_jpeg():
     whole = content[:2] + segment + content[2:]
     np.testing.assert_array_equal(decode_image(whole), decode_image(content))
     assert decode_image(whole[:-2]) is None
-    # Cameras fill their buffers with zeros.
+    # Cameras pad their buffers with zeros.
     np.testing.assert_array_equal(decode_image(whole + bytes(5000)), decode_image(content))
 
 
@@ -183,7 +183,7 @@ def test_no_header_is_an_error(start, rest):
 
 
 OTHER = Path(__file__).resolve().parents[2] / ".opencv4"
-# An emulated board finds this machine's there.
+# An emulated board finds the host's copy there.
 TAGS = "".join(path.read_text("utf-8") for path in OTHER.glob("*.dist-info/WHEEL")).lower()
 
 
@@ -192,7 +192,7 @@ TAGS = "".join(path.read_text("utf-8") for path in OTHER.glob("*.dist-info/WHEEL
     reason="needs OpenCV 5, and OpenCV 4.10 for this machine in .opencv4: make test",
 )
 def test_another_release_of_opencv_reads_the_same(tmp_path, clip_dir):
-    """Whole, cut and changed files of every format, decoded by OpenCV 4.10 and by this one."""
+    """OpenCV 4.10 and this release decode intact, cut and altered files of every format alike."""
     generator = np.random.default_rng(2)
     contents = [path.read_bytes() for path in sorted(clip_dir.glob("*.jpg"))[:5]]
     wide = generator.integers(0, 65536, (48, 64, 3)).astype(np.uint16)
@@ -231,13 +231,13 @@ def test_another_release_of_opencv_reads_the_same(tmp_path, clip_dir):
 
 
 def framed(jpeg, height, width):
-    """The JPEG with another size in its frame header."""
+    """Change the size in the JPEG's frame header."""
     place = jpeg.index(b"\xff\xc0") + 5
     return jpeg[:place] + struct.pack(">HH", height, width) + jpeg[place + 4 :]
 
 
 def tagged(*tags, picture=bytes(256)):
-    """A TIFF of 16x16 grey pixels whose first tags are these: (tag, type, count, value)."""
+    """Return a TIFF of 16x16 grey pixels that starts with these tags: (tag, type, count, value)."""
     rest = [
         *((258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 8), (277, 3, 1, 1)),
         *((278, 4, 1, 16), (279, 4, 1, len(picture))),
@@ -248,15 +248,18 @@ def tagged(*tags, picture=bytes(256)):
 
 
 def hidden_jpeg():
-    """A marker without a length in front: who takes two bytes for one skips the true header."""
+    """Return a JPEG that starts with a marker without a length.
+
+    A parser that reads a length there skips the true header.
+    """
     jpeg = encoded(".jpg", picture(16, 16))
     large = b"\xff\xd8\xff\x01" + framed(jpeg, 20000, 40000)[2:-2]
-    # 0xffe0, what stands where the length would be, further on there is a small picture.
+    # Read as a length, these bytes (0xffe0) lead to a small picture further on.
     return large + bytes(4 + 0xFFE0 - len(large)) + jpeg[2:]
 
 
 def extended_webp(height, width):
-    """An extended file whose canvas is not its picture's size."""
+    """Return an extended WebP whose canvas differs from the size of its picture."""
     webp = encoded(".webp", picture(16, 16))
     sizes = (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
     body = b"WEBPVP8X" + struct.pack("<I", 10) + bytes(4) + sizes + webp[12:]
@@ -306,7 +309,7 @@ def test_a_picture_of_many_passes_is_refused_and_one_of_ten_is_not():
 
 @pytest.mark.parametrize("frame", [b"\xff\xc0", b"\xff\xc1"])
 def test_scans_are_counted_where_a_decoder_reads_more_than_one(frame):
-    """A first scan of all components is the only one, whatever is behind; one of fewer is not."""
+    """A first scan of all components is the only one read; one of fewer components is not."""
     jpeg = cv2.imencode(".jpg", picture())[1].tobytes().replace(b"\xff\xc0", frame, 1)
     start = jpeg.index(b"\xff\xda")
     assert jpeg[start + 4] == 3

@@ -1,4 +1,4 @@
-"""The demonstration: one command in an empty folder, its picture, and what it says to expect."""
+"""The demonstration: one command in an empty folder, its picture and its expected figures."""
 
 import re
 import subprocess
@@ -73,7 +73,7 @@ def test_the_wheel_holds_what_the_demonstration_needs_and_stays_small():
     needed = {file for file in PACKAGED.rglob("*") if file.is_file()}
     assert len(needed) == 2 + 2 * 50 + 1
     assert needed <= packed
-    # The model and the JPEG files hardly compress; Python's text does.
+    # The model and the JPEG files hardly compress; Python sources do.
     sources = sum(file.stat().st_size for file in package.rglob("*.py"))
     assert sum(file.stat().st_size for file in packed) + sources / 3 < MOST_WHEEL_BYTES
 
@@ -101,9 +101,9 @@ def test_figures_are_in_order_and_of_flights_enough():
             low, median, high, mean = (entry[key][k] for k in ("q05", "median", "q95", "mean"))
             assert 0 < low <= median <= high <= 1
             assert low < mean < high
-        # All six at once are covered less often than one of them.
+        # Joint coverage of all six is lower than coverage of one degree of freedom.
         assert entry["all_six"]["mean"] < entry["one_dof"]["mean"]
-        # The bundles' statement is about a frame of a new flight.
+        # The bundles state coverage for a frame of a new flight.
         assert entry["one_dof"]["mean"] > 0.9
 
 
@@ -125,7 +125,7 @@ ABOUT_THE_PREDICTION = Chart("tangent_predicted")
 
 
 def flight(frames=12, shift_m=0.0, rotation=(0.0, 0.0, 0.0), chart=ABOUT_THE_PREDICTION):
-    """Straight flight along x, estimates ``shift_m`` and ``rotation`` off, half-widths 0.1."""
+    """Straight flight along x; estimates are ``shift_m`` and ``rotation`` off, half-widths 0.1."""
     estimates, truths = [], []
     turn = geometry.quaternion_exp(np.array(rotation))
     for seq in range(frames):
@@ -151,7 +151,7 @@ def flight(frames=12, shift_m=0.0, rotation=(0.0, 0.0, 0.0), chart=ABOUT_THE_PRE
 
 
 def count(picture, colour):
-    """Pixels within the rounding of a colour."""
+    """Count the pixels of a colour, within rounding."""
     return int((np.abs(picture.astype(int) - colour) <= 8).all(axis=2).sum())
 
 
@@ -175,7 +175,7 @@ def test_offsets_and_absolute_numbers_look_alike():
 
 def test_a_truth_outside_its_interval_is_marked():
     inside, outside = (draw_run(*flight(shift_m=shift), "title") for shift in (0.09, 0.11))
-    # The legend shows one mark; each of twelve frames adds one to either side.
+    # The legend shows one mark; each of the twelve frames adds one on either side.
     assert count(inside, MISSED) > 0
     assert count(outside, MISSED) > 12 * count(inside, MISSED)
 

@@ -1,4 +1,4 @@
-"""Written files: whole or not at all, with one line where they cannot be."""
+"""Files are written completely or not at all; failures yield a one-line error."""
 
 import os
 from pathlib import Path
@@ -37,7 +37,7 @@ def test_a_library_that_hides_the_failed_write_is_a_sink_error_too(tmp_path):
         try:
             raise OSError(28, "No space left on device")
         except OSError:
-            raise RuntimeError("unexpected position")  # noqa: B904 - as torch.save
+            raise RuntimeError("unexpected position")  # noqa: B904 - like torch.save
 
     with pytest.raises(SinkError, match="No space left"), whole_file(tmp_path / "a"):
         saves()

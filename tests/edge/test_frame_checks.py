@@ -1,4 +1,4 @@
-"""Frames that look wrong, and frames that look wrong where they stand, claim no interval."""
+"""Frames that look wrong, alone or within their stream, get no interval."""
 
 import threading
 
@@ -91,12 +91,12 @@ def test_a_driver_that_hands_out_its_old_buffers_again_is_noticed(images, buffer
     )
     assert first == [()] * buffers
     assert again == [[(Reason.FRAME_REPEATED,)] * buffers] * 2
-    # Alive again: its first new image is believed.
+    # The camera works again: the first new image is accepted.
     assert checks.doubts(look(images[buffers]), None, 0.0) == ()
 
 
 def test_a_still_scene_without_noise_where_something_moves_is_none_of_them(images):
-    """A rendered scene: the pixels looked at first are the same, and others are not."""
+    """In a rendered scene, the pixels compared first are equal, but others differ."""
     checks = StreamChecks()
     for column in range(12):
         image = images[0].copy()
@@ -130,7 +130,7 @@ def test_every_mode_sees_the_stream_in_its_order(bundle_dir, images, mode):
         Frame(images[6], 500, "", 0.0, queued_ms=1500.0),
         Frame(images[7], 600, "", 0.0),
     ]
-    # In live each waits until the one before was seen, or it would be left out.
+    # In live mode, deliver a frame only after the previous one was processed, or it is dropped.
     wanted = threading.Semaphore(1 if mode == "live" else len(frames))
 
     def coming():
@@ -180,7 +180,7 @@ def test_a_stamp_is_doubted_exactly_where_it_is_not_after_the_last_one(stamps):
         doubts = checks.doubts(None, stamp_ns, 0.0)
         backward = stamp_ns is not None and last is not None and stamp_ns <= last
         assert doubts == ((Reason.STAMP_NOT_LATER,) if backward else ())
-        # A clock that was set back counts from there: one frame, not an hour of them.
+        # A clock set back flags only the first frame: later stamps count from the new time.
         last = last if stamp_ns is None else stamp_ns
 
 

@@ -1,4 +1,4 @@
-"""Laws of the rotation group, drawn by hypothesis."""
+"""Laws of the rotation group, tested with hypothesis."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Ground truth: matrices and TUM files, and what is refused."""
+"""Ground truth: matrices and TUM files, and invalid input."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Every head's set is {y : score(y) <= q_hat}, with what its method adds to it."""
+"""Every head's set is {y : score(y) <= q_hat}, plus the properties of its method."""
 
 from typing import get_args
 
@@ -125,7 +125,7 @@ def test_a_negative_factor_is_refused_where_the_score_cannot_be_negative(make_he
 
 EDGES = [
     [-2.0, -1.0, 0.0, 0.5, 1.0, 2.0],
-    [-2.0, 0.0, 2.0],  # two classes only: three probabilities go unused
+    [-2.0, 0.0, 2.0],  # two classes only: three probabilities are unused
     [-1.5, -0.5, 0.0, 0.25, 1.0, 1.5],
     [-2.0, -1.0, 0.0, 1.0, 2.0],
     [-0.5, -0.25, 0.0, 0.25, 0.5, 0.75],
@@ -248,7 +248,7 @@ def test_class_parameters_that_do_not_fit_are_refused(make_head, change, match):
 def test_an_unused_class_is_never_the_likeliest(make_head):
     head = make_head("csp", "aps", parameters())
     outputs = probabilities(0)
-    outputs["probabilities"][0, 1] = [0.1, 0.2, 0.7, 0.0, 0.0]  # a DoF of two classes
+    outputs["probabilities"][0, 1] = [0.1, 0.2, 0.7, 0.0, 0.0]  # a DoF with two classes
     region = head.conformal_set(outputs, np.zeros(6), threshold([0.0] * 6))
     assert region.bands[1] == ((0.0, 2.0),)
 
@@ -266,7 +266,7 @@ POINTS = {"points": 20, "half_width_floor": FLOOR}
 
 
 def codebooks(seed, count=1):
-    """Outputs of ``count`` frames: 20 points, and a scale that leans."""
+    """Outputs of ``count`` frames: 20 points, and a scale with correlations."""
     generator = np.random.default_rng(seed)
     scale = np.tril(generator.normal(0.0, 0.1, (count, 6, 6)))
     scale[:, range(6), range(6)] = generator.uniform(0.1, 0.3, (count, 6))
@@ -275,7 +275,7 @@ def codebooks(seed, count=1):
 
 
 def near(outputs, seed, count=400):
-    """Points about the codebook of one frame, inside and outside of its region."""
+    """Points around the codebook of one frame, inside and outside its region."""
     generator = np.random.default_rng(seed)
     centres = outputs["codebook"][0, generator.integers(20, size=count)]
     steps = generator.standard_normal((count, 6)) * generator.uniform(0.0, 1.2, (count, 1))
@@ -315,7 +315,7 @@ def test_the_joint_region_is_exactly_where_the_distance_is_at_most_r(make_head, 
         assert scores.shape == (1, 1, 6)
         assert (scores == scores[0, 0, 0]).all()
         assert region.contains(y) == (scores[0, 0, 0] <= limit)
-        # The hull holds all that the region holds.
+        # The hull contains the region.
         assert region.covers(y).all() or not region.contains(y)
         inside += region.contains(y)
     assert (inside == 0) is (radius == 0.0)
@@ -327,7 +327,7 @@ def test_the_hull_touches_the_region_on_all_twelve_sides(make_head):
     region = head.conformal_set(outputs, np.zeros(6), threshold([1.5] * 6, scope="joint"))
     codebook, scale = outputs["codebook"][0].astype(float), outputs["scale"][0].astype(float)
     for dof in range(6):
-        # The ellipsoid's own point that lies furthest along this axis.
+        # The ellipsoid's furthest point along this axis, relative to its centre.
         furthest = 1.5 * scale @ scale[dof] / np.linalg.norm(scale[dof])
         top = codebook[codebook[:, dof].argmax()] + furthest
         bottom = codebook[codebook[:, dof].argmin()] - furthest

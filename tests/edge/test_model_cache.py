@@ -1,4 +1,4 @@
-"""Prepared models: the same numbers, never a changed byte, and never a reason not to run."""
+"""The model cache: identical numbers, no changed byte, and no failure prevents a run."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ def test_a_prepared_model_computes_the_very_same(method, bundle_dir, clip_dir, c
 def test_what_is_prepared_is_the_same_whatever_a_calibration_says_of_it(
     artifacts_dir, tmp_path, monkeypatch
 ):
-    """Of one model there is one entry: a bundle that calls it float32 must not spoil it."""
+    """A model has one entry: a bundle that declares it float32 must not spoil the entry."""
     bundle = read_bundle(artifacts_dir / "synthetic-room-cjp-int8")
-    # As on a processor on which it makes a difference.
+    # Simulate a processor on which the precision matters.
     monkeypatch.setattr("cvo_edge.engine.session.saturates", lambda: True)
     graphs = []
     for precision in ("int8", "fp32"):
@@ -112,7 +112,7 @@ def test_what_is_no_file_is_neither_waited_for_nor_followed(file, make, bundle_d
 
 
 def test_what_is_prepared_is_of_this_model_and_this_engine(bundle_dir, bundle, cache):
-    """Of two bundles that agree in every name and shape none runs with the other's model."""
+    """Two bundles may agree in all names and shapes; neither runs with the other's model."""
     prepared = read_bundle(bundle_dir, cache=cache).model
     eight = read_bundle(bundle_dir.with_name("synthetic-room-cjp-int8")).calibration
     elsewhere = msgspec.structs.replace(
@@ -125,7 +125,7 @@ def test_what_is_prepared_is_of_this_model_and_this_engine(bundle_dir, bundle, c
 
 
 def test_verify_asks_the_prepared_model_too(bundle_dir, cache, monkeypatch):
-    """An entry that was written with other weights, its digests made to fit."""
+    """The entry has other weights and matching digests."""
     read_bundle(bundle_dir, cache=cache)
     monkeypatch.setenv("CVO_EDGE_CACHE", str(cache.folder))
     command = [*CVO_EDGE, "verify", str(bundle_dir)]
@@ -167,7 +167,7 @@ def test_a_swapped_model_is_refused_whatever_the_cache_holds(copied_bundle, cach
 
 @pytest.fixture
 def settled(monkeypatch):
-    """Files count as settled at once."""
+    """Make files count as settled immediately."""
     monkeypatch.setattr("cvo_edge.engine.model_cache._SETTLED_NS", 0)
 
 
@@ -198,7 +198,7 @@ def test_a_model_of_the_same_size_and_times_is_refused(copied_bundle, cache, set
 
 
 def test_a_file_that_has_just_changed_is_not_remembered(copied_bundle, cache):
-    # Dated in the far future, it has just changed however long loading takes.
+    # A date in the far future counts as a recent change however long loading takes.
     os.utime(copied_bundle / "model.onnx", (2**32, 2**32))
     for _ in range(2):
         read_bundle(copied_bundle, cache=cache)
@@ -232,7 +232,7 @@ def test_a_cache_that_cannot_be_made_costs_nothing_but_itself(bundle_dir, tmp_pa
 
 
 def test_a_full_disk_costs_the_entry_alone(bundle_dir, clip_dir, tmp_path):
-    """Files of at most 64 KiB: onnxruntime cannot write the weights."""
+    """Limits files to 64 KiB, so that onnxruntime cannot write the weights."""
     program = (
         "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536));"
         "from cvo_edge.__main__ import main; main()"
@@ -283,7 +283,7 @@ def test_clear_removes_what_is_the_caches_own(bundle_dir, cache):
     cache.new_folder()
     (cache.folder / "someone's").mkdir()
     (cache.folder / "note.txt").write_text("mine")
-    # Of another program that keeps such a file, and one that even has such names.
+    # Folders of other programs: one contains a file of the same name, one also has a matching name.
     for name in ("data", 32 * "a"):
         (cache.folder / name).mkdir()
         (cache.folder / name / ENTRY_FILE).write_text("{}")

@@ -1,4 +1,4 @@
-"""The loop, on the demonstration bundle."""
+"""The odometer's loop, on the demonstration bundle."""
 
 import gc
 import subprocess
@@ -58,7 +58,7 @@ def test_joint_sets_hold_the_marginal_ones(bundle_dir, frames):
 
 @pytest.mark.whole_clip
 def test_clip_is_covered_about_as_often_as_stated(bundle_dir, clip_dir, frames):
-    # A new flight of the scene that was trained on: far from exact theory, near the number.
+    # A new flight of the training scene: exchangeability does not hold, coverage is only close.
     truth = open_ground_truth(clip_dir)
     with Odometer.load(bundle_dir) as odometer:
         covered = [e.covers(truth.pose_of(e)) for e in odometer.stream(frames)]

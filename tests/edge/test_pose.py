@@ -60,7 +60,7 @@ def test_the_point_is_the_poses_own_coordinates(rotation, t, v):
     chart = Chart(rotation, reference if rotation == "tangent_reference" else None)
     pose = pose_at(t, v)
     expected = chart.coordinates(pose, pose)
-    if np.linalg.norm(expected[3:]) < 3.14:  # at half a turn both ways are right
+    if np.linalg.norm(expected[3:]) < 3.14:  # at half a turn both signs are right
         np.testing.assert_allclose(chart.point(pose), expected, atol=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""The progress line of a run: what it says, how often, and that nothing of it stays."""
+"""The progress line of a run: its content, its rate, and that it is erased completely."""
 
 import io
 import sys

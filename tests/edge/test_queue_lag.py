@@ -1,4 +1,4 @@
-"""How old a frame may be: cameras with queues, on simulated time."""
+"""Bounds on the age of a frame: cameras with queues, on simulated time."""
 
 import itertools
 from collections import deque
@@ -10,21 +10,21 @@ from cvo_edge.input.capture import _Opened
 from cvo_edge.input.queue_lag import DriverStamps, LagAccount
 
 STALE_S = 1.0
-# How far the bound may miss the age of a frame.
+# Tolerated excess of a frame's age over its bound.
 TOLERANCE_S = 0.1
-# Below this age a frame that is flagged is a false alarm.
+# Flagging a frame younger than this is a false alarm.
 FRESH_S = 0.3
 
 
 class SimulatedCamera:
-    """A camera, its queue and a reader on simulated time; frames carry no time of their own.
+    """A camera, its queue and a reader on simulated time; frames carry no stamps.
 
-    ``period_s`` times a choice of ``jitter`` lies between frames. A queue of ``room`` frames drops
-    new frames when it is full. Decoding takes ``decoding`` periods of the reader's own time, or of
-    other threads' time if ``decodes_elsewhere``. ``pauses`` maps numbers of frames to seconds for
-    which nobody reads after them. ``stall(generator)`` draws the seconds for which the reader is
-    not run at each of five points of a read, while ``starved`` (begin, end) lasts; the kernel
-    reports it unless ``hidden``.
+    Frames are ``period_s`` times a choice of ``jitter`` apart. A full queue of ``room`` frames
+    drops new frames. Decoding takes ``decoding`` periods of the reader's own time, or of other
+    threads' time if ``decodes_elsewhere``. ``pauses`` maps frame numbers to seconds without a read
+    after that frame. ``stall(generator)`` draws the seconds for which the reader is not scheduled
+    at each of five points of a read, during ``starved`` (begin, end); the kernel reports them
+    unless ``hidden``.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class SimulatedCamera:
         self.now = self.busy = 0.0
 
     def _pass(self):
-        """Let the reader stand still, if it is starved."""
+        """Stall the reader if it is starved."""
         if self.stall is not None and self.starved[0] <= self.now < self.starved[1]:
             stalled = self.stall(self.generator)
             self.now += stalled
@@ -60,7 +60,7 @@ class SimulatedCamera:
                 self.busy += stalled
 
     def frames(self):
-        """Yield (age when used, bound when used, time) of each frame, read one after another."""
+        """Yield (age when used, bound when used, time) of each frame, in order."""
         queue, coming, number = deque(), 0, 0
         while True:
             self._pass()
@@ -92,7 +92,7 @@ class SimulatedCamera:
 
 
 def unsaid(frames):
-    """Ages of the frames that are old and would be ``ok``."""
+    """Ages of stale frames that would be ``ok``."""
     return [age for age, bound, _ in frames if age > STALE_S + TOLERANCE_S and bound <= STALE_S]
 
 
@@ -166,7 +166,7 @@ def test_no_old_frame_is_ok_while_and_after_the_reader_is_starved(kind, jitter):
 @pytest.mark.parametrize("kind", ["seldom", "below a second"])
 @pytest.mark.parametrize("jitter", JITTERS)
 def test_no_old_frame_is_ok_after_rare_stalls_that_the_kernel_does_not_report(kind, jitter):
-    """A stopped process, for example: to the kernel it is asleep."""
+    """For example, the kernel sees a stopped process as asleep."""
     for period_s, (decoding, room) in itertools.product(PERIODS, SETTINGS):
         span = (70 * period_s, 280 * period_s)
         camera = SimulatedCamera(
@@ -176,7 +176,7 @@ def test_no_old_frame_is_ok_after_rare_stalls_that_the_kernel_does_not_report(ki
 
 
 def bounds(gaps, claimed_fps=30.0, opened_after=0.0):
-    """Bounds of frames with these gaps, which a reader that only sleeps has waited for."""
+    """Bounds of frames with these gaps, for a reader that only sleeps between frames."""
     account, now, found = LagAccount(0.0, claimed_fps), opened_after, []
     for gap in gaps:
         now += gap
@@ -272,7 +272,7 @@ def test_the_position_of_another_backend_is_no_stamp(clock):
 def test_frames_from_before_a_suspension_are_older_by_its_length():
     stamps = DriverStamps()
     assert stamps.age_s(99.9, 100.0, 500.0) == pytest.approx(0.1)
-    # Suspended for an hour: the monotonic clock stood still.
+    # After an hour of suspension, in which the monotonic clock stood still.
     assert stamps.age_s(100.0, 100.2, 4100.2) == pytest.approx(3600.2)
     assert stamps.age_s(100.1, 100.25, 4100.25) == pytest.approx(3600.15)
     assert stamps.age_s(100.25, 100.3, 4100.3) == pytest.approx(0.05)

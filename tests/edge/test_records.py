@@ -1,4 +1,4 @@
-"""What is written about a frame can be read back, without its bundle and from a cut file."""
+"""Records can be read back without their bundle, even from a truncated file."""
 
 import dataclasses
 import json
@@ -28,7 +28,7 @@ from cvo_edge.output.records import header_of
 from cvo_edge.output.sinks import Sink
 from cvo_edge.sets import unbounded_set
 
-# Written by version 0.1.0 before there were headers.
+# Written by version 0.1.0, before headers existed.
 OLD = Path(__file__).parent / "old_records"
 OLD_JSON_LINES = sorted(OLD.glob("*.jsonl"))
 
@@ -43,7 +43,7 @@ def band_of(band):
 
 
 def estimate_of(record):
-    """The estimate that a record describes, from the decoded JSON line."""
+    """Return the estimate that a record describes, from the decoded JSON line."""
     pose, interval = record["pose"], record["interval"]
     found, chart = unbounded_set(), Chart("tangent_predicted")
     if interval is not None:
@@ -82,14 +82,14 @@ def written(path, estimates, format="jsonl", header=None, *, region=False):
 
 @pytest.fixture(scope="module", params=["cjp", "cqr", "csp", "mcqr"])
 def recorded(request, artifacts_dir, clip_dir, tmp_path_factory):
-    """A file of a few records, its header, and the estimates it was written from."""
+    """A file of a few records, its header, and the estimates in it."""
     path = tmp_path_factory.mktemp("records") / "records.jsonl"
     region = request.param == "mcqr"
     with Odometer.load(
         artifacts_dir / f"synthetic-room-{request.param}", scope="joint", threads=1
     ) as odometer:
         frames = [frame for frame, _ in zip(open_source(str(clip_dir)), range(3), strict=False)]
-        # A repeated image, and no image.
+        # A repeated image and a missing one.
         images = [*(frame.image for frame in frames), frames[-1].image, None]
         estimates = [odometer.step(image, stamp) for stamp, image in enumerate(images)]
         header = header_of(odometer.calibration, odometer.chart, 0.9, "joint", "fps")
@@ -154,7 +154,7 @@ def test_any_estimate_is_the_same_after_json(estimate, region):
     line = msgspec.json.encode(record)
     assert msgspec.json.decode(line, type=Record) == record
     assert json.loads(line) == estimate.to_dict(region=region)
-    # And back: the numbers of the estimate, to the last bit.
+    # Converting back yields the numbers of the estimate, bit for bit.
     again = estimate_of(json.loads(line)).to_record(region=region)
     assert msgspec.json.encode(again) == line
 
@@ -194,9 +194,9 @@ def test_rows_of_other_formats_are_those_of_the_version_before(name, tmp_path, r
     again = written(tmp_path / name, estimates, format, recorded[1]).decode()
     rows = [line for line in again.splitlines() if not line.startswith("#")]
     expected = (OLD / name).read_text().splitlines()
-    if format == "csv":  # another run, with latencies of its own
+    if format == "csv":  # another run, with different latencies
         rows, expected = ([line.rsplit(",", 5)[0] for line in each] for each in (rows, expected))
-    else:  # the frames that both runs have
+    else:  # the frames of both runs
         rows, expected = rows[:2], expected[:2]
     assert rows == expected
 

@@ -1,4 +1,4 @@
-"""Scheduling of streams: order, errors in their place, the newest frame."""
+"""Scheduling of streams: order, errors at their position, the newest frame."""
 
 import json
 import subprocess
@@ -16,7 +16,7 @@ from cvo_edge.input.newest import Newest, Played
 from cvo_edge.scheduling import in_order, plan
 from cvo_edge.vocabulary import MODES
 
-# Only a defect lets a wait last so long.
+# Only a defect makes a wait take this long.
 HANGS_S = 120.0
 
 
@@ -33,7 +33,7 @@ def test_results_come_in_the_order_of_their_tasks():
     done = [threading.Event() for _ in range(60)]
 
     def task(number):
-        # Each even task ends after the one behind it.
+        # Each even task ends after its successor.
         if number % 2 == 0:
             assert done[number + 1].wait(HANGS_S)
         done[number].set()
@@ -82,7 +82,7 @@ def picture_free(number):
 
 
 class Stepping:
-    """Frames that come when a test says so."""
+    """A source whose frames arrive when a test releases them."""
 
     def __init__(self, count, failure=None):
         self._go, self._asked = threading.Semaphore(0), threading.Semaphore(0)
@@ -98,7 +98,7 @@ class Stepping:
             raise self._failure
 
     def give(self, count):
-        """Let so many frames come, one after another, until the next one is asked for."""
+        """Release this many frames, one by one, until the next one is requested."""
         for _ in range(count):
             assert self._asked.acquire(timeout=HANGS_S)
             self._go.release()
@@ -201,7 +201,7 @@ def test_nothing_reads_on_when_a_live_stream_is_left(bundle_dir):
 
 
 def test_a_process_exits_cleanly_while_a_video_is_being_read(bundle_dir, clip_dir, tmp_path):
-    # Large, so that the reader is inside OpenCV most of the time.
+    # The images are large, so that the reader spends most of its time inside OpenCV.
     frame = next(iter(open_source(str(clip_dir))))
     path = tmp_path / "large.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (2560, 1920))
@@ -240,7 +240,7 @@ def test_every_mode_gives_the_same_numbers(bundle_dir, clip_dir, clock):
     assert intervals(found["live"]).items() <= latency.items()
     numbers = [each.seq for each in found["live"]]
     assert all(a < b for a, b in pairwise(numbers))
-    assert numbers[-1] == 49  # the last one is never dropped
+    assert numbers[-1] == 49  # the last frame is never dropped
 
 
 def test_a_caller_may_write_the_next_image_into_the_same_memory(bundle_dir, clip_dir):

@@ -1,4 +1,4 @@
-"""How many cores there are, and whether they can multiply 8-bit numbers."""
+"""The number of usable cores, and exact products of 8-bit numbers."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_core_that_is_taken_away_costs_the_pinning_alone(bundle):
     with Odometer(bundle, threads=1) as odometer:
         image = preprocess.selftest_image(192, 256)
         expected = odometer.observe(image, 0)
-        # As if a control group had lost it since.
+        # Simulate a control group that has removed the core since.
         odometer.session._caller_core = {1023}
         before = os.sched_getaffinity(0)
         for _ in range(2):
@@ -106,7 +106,7 @@ def test_a_core_that_is_taken_away_costs_the_pinning_alone(bundle):
 
 
 def test_sums_of_8_bit_products_are_exact_as_a_session_is_set_up():
-    """On x86 without VNNI they are only because the session is told to be precise."""
+    """On x86 without VNNI, sums are exact only with the session's precise setting."""
     options = onnxruntime.SessionOptions()
     precise = str(int(session.saturates()))
     options.add_session_config_entry("session.x64quantprecision", precise)

@@ -1,4 +1,4 @@
-"""Formats: what each line holds, and what a disk that refuses leaves behind."""
+"""Output formats: the content of each line, and the file after a failed write."""
 
 import csv
 import dataclasses
@@ -123,7 +123,7 @@ def test_tum_without_stamps_is_refused(tmp_path, bundle_dir, clip_dir):
 
 
 def table(path, estimates):
-    """Heading and rows of a table; no line is wider than a terminal."""
+    """Return heading and rows of a table; no line is wider than a terminal."""
     lines = write(path, "table", estimates).splitlines()
     assert all(len(line) <= 80 for line in lines)
     return lines[:4], lines[4:]
@@ -172,7 +172,7 @@ def test_no_number_breaks_the_columns_of_a_table(estimates, tmp_path_factory, t_
     assert [cell.strip()[0] for cell in cells] == ["±"] * 6
     cm_or_deg = half * ([100.0] * 3 + [np.rad2deg(1.0)] * 3)
     found = [float(cell.strip(" ±*")) for cell in cells]
-    # One digit is left of numbers with an exponent.
+    # Numbers with an exponent keep one digit.
     np.testing.assert_allclose(found, cm_or_deg, rtol=0.34, atol=0.0501)
     assert [cell.endswith("*") for cell in cells] == [pieces] * 6
 
@@ -288,7 +288,7 @@ def test_a_line_that_fits_in_part_only_is_taken_back(
             sink.write(estimates[1])
         monkeypatch.undo()
         assert path.read_bytes() == whole
-        # Room was made: it goes on behind the last whole line.
+        # With space available, writing continues after the last complete line.
         sink.write(estimates[2])
     assert (
         path.read_bytes()

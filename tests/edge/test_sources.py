@@ -1,4 +1,4 @@
-"""Sources: order, damage, ends, stamps."""
+"""Sources: order, damaged frames, ends and stamps."""
 
 import gc
 import os
@@ -113,7 +113,7 @@ def test_fps_must_be_of_a_camera(tmp_path, fps):
 
 def test_hidden_files_are_no_frames(tmp_path):
     write(tmp_path / "0.png")
-    # As macOS leaves one beside each file on a card.
+    # macOS writes such a companion file for each file on a card.
     (tmp_path / "._0.png").write_bytes(b"\0\5\x16\7")
     assert names(open_source(str(tmp_path))) == ["0.png"]
 
@@ -172,7 +172,7 @@ def test_a_video_cut_short_is_told_after_its_frames(video):
 
 @pytest.mark.parametrize("damaged", [[7], [0], [3, 4, 5], [0, 1, 9]])
 def test_a_damaged_frame_of_a_video_affects_no_other(video, damaged):
-    """It has no image; later frames keep their pixels, names and stamps."""
+    """It yields no image; later frames keep their pixels, names and stamps."""
     whole = list(open_source(str(video)))
     content = bytearray(video.read_bytes())
     starts = [found.start() for found in re.finditer(rb"00dc.{4}\xff\xd8", content, re.DOTALL)]
@@ -190,9 +190,9 @@ def test_a_damaged_frame_of_a_video_affects_no_other(video, damaged):
 
 
 def test_a_video_without_an_end_in_sight_ends(video):
-    """A container that announces more than it holds is asked a bounded number of times."""
+    """A container that announces more frames than it holds is read a bounded number of times."""
     content = bytearray(video.read_bytes())
-    # Frames of the whole file (avih), then of its stream (strh).
+    # Frame count of the file (avih), then of its stream (strh).
     announced = (20).to_bytes(4, "little")
     for place in (content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32):
         assert content[place : place + 4] == announced
@@ -203,12 +203,12 @@ def test_a_video_without_an_end_in_sight_ends(video):
 
 
 def test_stamps_are_the_container_s_times():
-    """Of unequal lengths, too; an OpenCV that counts from a frame's end gives the same."""
+    """Includes frames of unequal length, and an OpenCV that reports the frame's end."""
     for shift_ms in (0.0, 40.0):
         stamps = _VideoStamps(None, 25.0)
         found = [stamps.next(1, shift_ms + place) for place in (0.0, 40.0, 90.0, 120.0)]
         assert found == [[0], [40_000_000], [90_000_000], [120_000_000]]
-        # Two that could not be read are put between.
+        # Two unreadable frames are interpolated.
         assert stamps.next(3, shift_ms + 240.0) == [160_000_000, 200_000_000, 240_000_000]
 
 
@@ -281,7 +281,7 @@ def test_a_file_of_any_kind_and_size_affects_its_own_frame_only(tmp_path):
     write(tmp_path / "2.png")
     frames = list(open_source(str(tmp_path)))
     assert [frame.image is None for frame in frames] == [False, True, False]
-    # What was a file when it was listed may be a pipe when it is read.
+    # A file that was listed may have become a pipe before it is read.
     (tmp_path / "1.png").unlink()
     os.mkfifo(tmp_path / "1.png")
     assert [frame.image is None for frame in source] == [False, True]

@@ -73,7 +73,7 @@ def test_weights_are_loaded_by_name_and_their_digest_returned(tmp_path):
 
 def test_wrong_weights_are_refused(tmp_path):
     path = tmp_path / "weights.safetensors"
-    with pytest.raises(UsageError, match="found none"):
+    with pytest.raises(UsageError, match="found no file at"):
         load_weights(backbone(), str(path))
     path.write_bytes(b"not safetensors")
     with pytest.raises(UsageError, match="not a valid safetensors file"):

@@ -196,9 +196,9 @@ def test_names_of_cells_depend_on_no_place(studied, monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("title = 1", "expected a study"),
+        ("title = 1", "not a valid study"),
         (CONFIG.replace("steps", "stepz"), "unknown field `stepz`"),
-        (CONFIG.replace('"sharpness"', '"METHODS"'), "names of grids that differ"),
+        (CONFIG.replace('"sharpness"', '"METHODS"'), "grid names must differ"),
         (CONFIG.replace("sharpness = [0.5", "stages = [4"), "stages: expected text, found 4"),
         (CONFIG.replace("sharpness = [0.5, 1.0]", "grid = [3]"), "grid: expected text, found 3"),
         (CONFIG.replace("sharpness = [0.5", 'share = ["half"'), "share: expected above 0"),
@@ -212,13 +212,13 @@ def test_names_of_cells_depend_on_no_place(studied, monkeypatch, tmp_path):
         (CONFIG.replace("sharpness = [0.5", "dropout = [2.0"), "grid sharpness: .*dropout"),
         (CONFIG.replace('["cjp"]', '["cjp", "cjp"]'), "methods: expected each value once"),
         (CONFIG.replace('"none"', '"/nowhere.safetensors"'), "expected a safetensors file"),
-        (CONFIG.replace("copies", 'backbones = ["a/b"]\ncopies'), "expected a model of timm"),
+        (CONFIG.replace("copies", 'backbones = ["a/b"]\ncopies'), "expected a timm model"),
         (CONFIG.replace("$CVO_TEST_DATA", DATASET.split(",")[0] + ",flights=1,frames=20"), "val"),
         (CONFIG.replace("speckle:0.3", "rain"), "expected NAME or NAME:STRENGTH"),
         (CONFIG.replace('["cjp"]', '["abc"]'), "expected one of cjp"),
         (CONFIG.replace("sharpness = [0.5", "classes = [4"), "--classes is not an option of cjp"),
         (CONFIG.replace("CVO_TEST_DATA", "CVO_UNSET"), "variable CVO_UNSET is not set"),
-        ("grids = [", "expected a study"),
+        ("grids = [", "not a valid study"),
     ],
 )
 def test_a_study_that_cannot_be_is_refused_before_anything(text, message, tmp_path, monkeypatch):
