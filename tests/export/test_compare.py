@@ -184,7 +184,9 @@ def test_a_failed_cell_is_named_and_the_others_are_run(copied, options):
     split.unlink()
     gaussian.unlink()
     (copied / "bundles" / split.stem / "precious.txt").write_text("keep")
-    with pytest.raises(SinkError, match=rf"1 of 2 cells failed \({split.stem}\); run the same command"):
+    with pytest.raises(
+        SinkError, match=rf"1 of 2 cells failed \({split.stem}\); run the same command"
+    ):
         compared_again(copied, options)
     # The run was complete already, so its training time is not known.
     assert cell(copied, "gaussian-0")["training"] is None
