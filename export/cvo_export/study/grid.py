@@ -242,7 +242,7 @@ def _add(plan: Plan, grid: Grid) -> None:
 
 
 def _check_networks(configs: Iterable[TrainConfig]) -> None:
-    """Raise UsageError if a backbone cannot be built or does not fit its weights."""
+    """Raise UsageError if a backbone cannot be built, or if the weights do not fit it."""
     distinct = {
         msgspec.json.encode((c.backbone, c.height, c.width, c.weights)): c
         for c in configs

@@ -49,7 +49,7 @@ def ray_engine() -> Iterator[Engine]:
     try:
         # Tasks print their own progress.
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-        # Ray replaces the signal handlers by its own, which use another exit code.
+        # Ray installs its own signal handlers, which use another exit code.
         for number, handler in handlers.items():
             signal.signal(number, handler)
     except (ConnectionError, ValueError, RuntimeError) as error:

@@ -59,7 +59,7 @@ class Lesson:
         self._path = material.run_dir / f"checkpoint-{name}.pt"
 
     def fit(self) -> list[History]:
-        """Run all phases, from the checkpoint if it exists; returns the history."""
+        """Run all phases, resuming from a checkpoint if one exists; returns the history."""
         checkpoint = self._read_checkpoint()
         first = checkpoint["phase"] if checkpoint else 0
         phases = 3 if self.config.fine_tune and self._examples is None else 1
