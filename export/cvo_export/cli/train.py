@@ -150,7 +150,7 @@ def _with_method_options() -> TyperCommand:
     from cvo_export.training.options import method_parameters
 
     about = typer.Argument(
-        metavar="method", help=f"One of {', '.join(TRAINABLE)}.", show_default=False
+        metavar="method", help="Conformal method or baseline.", show_default=False
     )
     chosen: Any = Annotated[Literal[tuple(TRAINABLE)], about]
     method, *others = signature(_train, eval_str=True).parameters.values()

@@ -105,9 +105,8 @@ def _common_type(fields: list[_Field]) -> Any:  # noqa: ANN401 - types of any ki
 def _help(fields: list[_Field], n_methods: int) -> str:
     """Return a sentence for each meaning, followed by the methods' defaults."""
     if len(fields) == 1:
-        notes = [fields[0].bounds]
-        if fields[0].default is not None:
-            notes.append(f"default: {_shown(fields[0].default)}")
+        default = _shown(fields[0].default)
+        notes = [fields[0].bounds, f"default: {default}" if default else ""]
         return _with_notes(fields[0].description, notes)
     meanings: dict[tuple[str, str], list[_Field]] = {}
     for field in fields:
@@ -124,16 +123,20 @@ def _defaults(fields: list[_Field], n_methods: int) -> str:
         methods.setdefault(_shown(field.default), []).append(field.method)
     if len(methods) == 1 and len(fields) == n_methods:
         return f"all methods: {next(iter(methods))}"
-    return "; ".join(f"{', '.join(names)}: {default}" for default, names in methods.items())
+    return "; ".join(
+        f"{', '.join(names)}: {default}" if default else ", ".join(names)
+        for default, names in methods.items()
+    )
 
 
 def _with_notes(description: str, notes: list[str]) -> str:
-    return f"{description} ({'; '.join(note for note in notes if note)})"
+    given = "; ".join(note for note in notes if note)
+    return f"{description} ({given})".strip() if given else description
 
 
 def _shown(value: object) -> str:
     if value is None:
-        return "not given"
+        return ""
     if isinstance(value, tuple):
         return " ".join(_shown(part) for part in value)
     return f"{value:.3g}" if isinstance(value, float) else str(value)
