@@ -19,6 +19,7 @@ import pytest
 
 from cvo_edge import SourceError, UsageError, open_source
 from cvo_edge.input.capture import READER, Capture, Grabbed, shown
+from cvo_edge.input.clock import Clock
 from cvo_edge.input.sources import PAUSES_S, Camera
 
 # Only a defect makes a wait take this long.
@@ -457,3 +458,52 @@ def test_a_failure_inside_opencv_is_an_unreadable_frame(monkeypatch, clip_dir):
     assert capture.read() is None
     capture.close()
     assert not any(t.name == READER and t.is_alive() for t in threading.enumerate())
+
+
+def test_a_device_that_fails_inside_opencv_does_not_open(monkeypatch):
+    class Failing:
+        def open(self, device):
+            raise cv2.error("inside")
+
+        def release(self):
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Failing)
+    with pytest.raises(SourceError, match="did not open as a video or camera"):
+        Capture("camera", HANGS_S).open()
+
+
+def test_a_defect_in_the_reading_thread_reaches_the_caller(monkeypatch):
+    class Defective:
+        def open(self, device):
+            raise ValueError("a defect")
+
+        def release(self):
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Defective)
+    with pytest.raises(ValueError, match="a defect"):
+        Capture("camera", HANGS_S).open()
+
+
+def test_without_a_thread_to_read_it_a_camera_is_refused(monkeypatch):
+    def start(thread):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr("cvo_edge.input.capture.Thread.start", start)
+    with pytest.raises(SourceError, match="cannot start its reading thread"):
+        Capture("camera", HANGS_S)
+
+
+@pytest.mark.parametrize(
+    ("content", "busy_s"), [(b"2000000000 500000000 7\n", 2.5), (b"", 11.0), (None, 11.0)]
+)
+def test_time_ready_to_run_counts_as_busy_where_the_kernel_reports_it(
+    monkeypatch, tmp_path, content, busy_s
+):
+    path = tmp_path / "schedstat"
+    if content is not None:
+        path.write_bytes(content)
+    monkeypatch.setattr("cvo_edge.input.clock._SCHEDSTAT", path)
+    monkeypatch.setattr("time.thread_time", lambda: 11.0)
+    assert Clock().busy_s() == pytest.approx(busy_s)
