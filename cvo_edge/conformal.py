@@ -31,6 +31,14 @@ def conformal_rank(n: int, confidence: float) -> int:
     return max(1, math.ceil((n + 1) * confidence - _RANK_TOLERANCE))
 
 
+def least_draws(confidence: float) -> int:
+    """Return the least n for which k <= n, so that a threshold is finite: c / (1 - c), rounded up.
+
+    ``n`` counts frames, or recordings where each of them counts once.
+    """
+    return math.ceil(confidence / (1.0 - confidence) - _RANK_TOLERANCE)
+
+
 def conformal_quantile(scores: ArrayLike, confidence: float) -> float:
     """Return q_hat of scores (n,): the k-th smallest, or infinity if k > n.
 

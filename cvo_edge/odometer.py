@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cvo_edge.bundle.format import Threshold
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.model_cache import ModelCache
-from cvo_edge.engine.observer import Observation, Observer
+from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import ModelError, UsageError
 from cvo_edge.estimate import PoseInterval, Reason, Status
@@ -33,7 +33,7 @@ from cvo_edge.vocabulary import Scope
 _STEEP_PITCH = np.deg2rad(80.0)
 
 
-class Seen(NamedTuple):
+class Processed(NamedTuple):
     """One frame before its stream checks: the result of a worker and the input of ``conclude``.
 
     ``conformal_set`` is unbounded if the observation has a fault or a doubt. ``conformal_ms`` is
@@ -226,7 +226,7 @@ class Odometer:
         frame = Frame(image_bgr, stamp_ns, source, read_ms)
         # Stream checks compare consecutive frames, so threads must not interleave.
         with self._stepping:
-            return self.conclude(self._see(frame, self._seq))
+            return self.conclude(self._process(frame, self._seq))
 
     def stream(self, frames: Iterable[Frame | NDArray[Any]]) -> Generator[PoseInterval, None, None]:
         """Yield estimates for a source, for frames or for BGR images, lazily and in order.
@@ -247,24 +247,14 @@ class Odometer:
             )
         self._stream_checks = StreamChecks()
         with closing(
-            run_stream(frames, self.mode, self._workers, self._see, lambda: self._seq, self._clock)
+            run_stream(
+                frames, self.mode, self._workers, self._process, lambda: self._seq, self._clock
+            )
         ) as stream:
-            for seen in stream:
-                yield self.conclude(seen)
+            for processed in stream:
+                yield self.conclude(processed)
 
-    def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
-        """Run the network on one image without applying a threshold; see ``Observer.observe``."""
-        return self._observer.observe(image_bgr, seq)
-
-    def conformal_set(
-        self, observation: Observation, threshold: Threshold | None = None
-    ) -> ConformalSet:
-        """Return the set of an observation, by default with the odometer's threshold."""
-        return self.head.conformal_set(
-            observation.outputs, observation.point, threshold or self.threshold
-        )
-
-    def _see(self, frame: Frame, seq: int) -> Seen:
+    def _process(self, frame: Frame, seq: int) -> Processed:
         """Process a frame as far as it does not depend on earlier frames; thread-safe."""
         waited_ms = max(frame.read_ms, frame.since_arrival_ms(self._clock.now_s()))
         start = perf_counter()
@@ -274,16 +264,16 @@ class Odometer:
         found = self.conformal_set(observation) if usable else unbounded_set()
         end = perf_counter()
         conformal_ms, total_ms = 1e3 * (end - observed), waited_ms + 1e3 * (end - start)
-        return Seen(frame, seq, observation, found, conformal_ms, total_ms)
+        return Processed(frame, seq, observation, found, conformal_ms, total_ms)
 
-    def conclude(self, seen: Seen) -> PoseInterval:
+    def conclude(self, processed: Processed) -> PoseInterval:
         """Apply the stream checks and build the estimate; call it once per frame, in order.
 
         The set is finite only if neither the frame checks nor the stream checks raise a doubt.
         """
-        frame, observation = seen.frame, seen.observation
-        self._seq = seen.seq + 1
-        fault, found = observation.fault, seen.conformal_set
+        frame, observation = processed.frame, processed.observation
+        self._seq = processed.seq + 1
+        fault, found = observation.fault, processed.conformal_set
         doubts = tuple(reason for reason in (observation.doubt, fault) if reason is not None)
         # The age counts until the estimate is given: a process may be stopped at any point.
         age_ms = frame.age_ms(self._clock.now_s())
@@ -291,7 +281,7 @@ class Odometer:
         if doubts:
             found = unbounded_set()
         return PoseInterval(
-            seq=seen.seq,
+            seq=processed.seq,
             stamp_ns=frame.stamp_ns,
             source=frame.source,
             status=Status.INVALID if fault else Status.DEGRADED if doubts else Status.OK,
@@ -305,15 +295,10 @@ class Odometer:
                 "read": round(frame.read_ms, 4),
                 "preprocess": round(observation.preprocess_ms, 4),
                 "model": round(observation.model_ms, 4),
-                "conformal": round(seen.conformal_ms, 4),
-                "total": round(seen.total_ms, 4),
+                "conformal": round(processed.conformal_ms, 4),
+                "total": round(processed.total_ms, 4),
             },
         )
-
-    @property
-    def has_region(self) -> bool:
-        """Whether sets are joint regions of all six degrees of freedom."""
-        return self.scope == "joint" and self.head.one_joint_score
 
     def _remarks(self, observation: Observation, found: ConformalSet) -> tuple[Reason, ...]:
         remarks: tuple[Reason, ...] = ()
@@ -322,3 +307,20 @@ class Odometer:
         if self.chart.rotation == "euler_zyx" and abs(observation.point[4]) > _STEEP_PITCH:
             remarks += (Reason.PITCH_NEAR_90,)
         return remarks
+
+    def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
+        """Run the network on one image without applying a threshold; see ``Observer.observe``."""
+        return self._observer.observe(image_bgr, seq)
+
+    def conformal_set(
+        self, observation: Observation, threshold: Threshold | None = None
+    ) -> ConformalSet:
+        """Return the set of an observation, by default with the odometer's threshold."""
+        return self.head.conformal_set(
+            observation.outputs, observation.point, threshold or self.threshold
+        )
+
+    @property
+    def has_region(self) -> bool:
+        """Whether sets are joint regions of all six degrees of freedom."""
+        return self.scope == "joint" and self.head.one_joint_score

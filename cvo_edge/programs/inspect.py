@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from textwrap import wrap
 from typing import Any
 
 import msgspec
 
 from cvo_edge.bundle.format import Calibration, CalibrationSpec
+from cvo_edge.conformal import least_draws
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.heads.checked import checked_head
@@ -86,7 +86,7 @@ def _unbounded(calibration: Calibration, head: Head) -> list[str]:
         level = max(level for level, _ in sides)
         if entry.scope == "joint" and source.joint == "max":
             level = entry.confidence
-        needed = math.ceil(level / (1.0 - level) - 1e-9)
+        needed = least_draws(level)
         reason = f"needs at least {needed} calibration {unit}, has {given}"
         if given >= needed:
             reason = head.infinite_score

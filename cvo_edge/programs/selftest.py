@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cvo_edge.engine.observer import Observation, Observer
+from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.errors import GateError
 from cvo_edge.input import preprocess
 from cvo_edge.odometer import Odometer

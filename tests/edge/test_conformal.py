@@ -15,6 +15,7 @@ from cvo_edge.conformal import (
     effective_sample_size,
     hierarchical_quantile,
     interval_score,
+    least_draws,
 )
 from cvo_edge.errors import UsageError
 
@@ -139,3 +140,10 @@ def test_effective_size_of_an_autoregression_is_the_closed_form(phi):
     for index in range(1, n):
         series[index] = phi * series[index - 1] + generator.standard_normal()
     assert effective_sample_size(series) == pytest.approx(n * (1 - phi) / (1 + phi), rel=0.25)
+
+
+@given(st.floats(0.01, 0.999))
+def test_a_threshold_is_finite_from_the_least_number_of_draws_on(confidence):
+    n = least_draws(confidence)
+    assert conformal_rank(n, confidence) <= n
+    assert n == 1 or conformal_rank(n - 1, confidence) > n - 1

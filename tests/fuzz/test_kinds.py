@@ -61,7 +61,7 @@ def test_what_would_be_a_finding_is_one(monkeypatch, artifacts_dir):
     monkeypatch.setattr(bundles, "read_bundle", lambda _: None)
     assert len(bundles.models(4).findings) == len(bundles.artifacts(4).findings) == 4
     # Without frame checks, every faulted frame gets an interval.
-    monkeypatch.setattr("cvo_edge.engine.observer.image_doubt", lambda _: None)
+    monkeypatch.setattr("cvo_edge.engine.observation.image_doubt", lambda _: None)
     monkeypatch.setattr("cvo_edge.input.frame_checks.StreamChecks.doubts", lambda *_: ())
     assert sensors.sensors(40).findings
     monkeypatch.setattr(simulation, "conformal_quantile", lambda scores, _: scores.max())

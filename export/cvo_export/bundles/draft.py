@@ -31,7 +31,7 @@ from cvo_edge.bundle.format import (
     Threshold,
 )
 from cvo_edge.bundle.reading import UNWRITTEN
-from cvo_edge.engine.observer import Observer
+from cvo_edge.engine.observation import Observer
 from cvo_edge.engine.session import Session
 from cvo_edge.heads import HEADS, Candidate, Head
 from cvo_edge.heads.checked import check_tensors

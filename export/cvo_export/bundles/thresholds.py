@@ -21,7 +21,7 @@ from cvo_edge.conformal import (
     hierarchical_quantile,
     interval_score,
 )
-from cvo_edge.engine.observer import Observation, Observer
+from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.heads import Candidate, Head
 from cvo_edge.odometer import Odometer
