@@ -63,7 +63,7 @@ StepsOption = Annotated[
 TrainingSplitOption = Annotated[
     SplitKind | None,
     typer.Option(
-        help="Unit of the split; default: sequence if there are at least five, else block.",
+        help="Unit of the split; default: sequence if there are at least five, otherwise block.",
         rich_help_panel=DATA,
     ),
 ]
@@ -71,8 +71,8 @@ TrainingSplitOption = Annotated[
 RuleOption = Annotated[
     Rule | None,
     typer.Option(
-        help="What one calibration draw is: a frame (pooled) or a sequence (hierarchical); "
-        "default: hierarchical for a split by sequence, else pooled."
+        help="Unit of a calibration draw: a frame (pooled) or a sequence (hierarchical); "
+        "default: hierarchical for a split by sequence, otherwise pooled."
     ),
 ]
 JointOption = Annotated[
@@ -86,7 +86,7 @@ ScoreOption = Annotated[
 ]
 SidesOption = Annotated[
     Sides | None,
-    typer.Option(help="cqr: bounds that are calibrated; default in a new bundle: symmetric."),
+    typer.Option(help="cqr: how the bounds are calibrated; default in a new bundle: symmetric."),
 ]
 NameOption = Annotated[str | None, typer.Option(help="Default: the folder's name.")]
 

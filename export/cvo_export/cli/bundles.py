@@ -32,7 +32,7 @@ def publish(
     run_dir: Annotated[Path, typer.Argument(help="A finished run.", show_default=False)],
     bundle: Annotated[Path, typer.Argument(help="Bundle folder to write.", show_default=False)],
     precision: Annotated[
-        Precision, typer.Option(help="int8: an 8-bit backbone, with thresholds of its own.")
+        Precision, typer.Option(help="int8: an 8-bit backbone with its own thresholds.")
     ] = "fp32",
     provider: Annotated[
         Provider, typer.Option(help="Engine that the bundle is calibrated for and runs on.")
@@ -80,7 +80,7 @@ def calibrate(
     split: Annotated[
         SplitKind | None,
         typer.Option(
-            help="Unit of the split; default: sequence if there are at least three, else block."
+            help="Unit of the split; default: sequence if there are three or more, otherwise block."
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the split; default: 0.")] = None,
@@ -97,7 +97,7 @@ def calibrate(
     ] = None,
     new_data: Annotated[
         bool,
-        typer.Option("--new-data", help="Bundle: accept data of the same name as new."),
+        typer.Option("--new-data", help="Bundle: treat a data set of the same name as unseen."),
     ] = False,
     provider: Annotated[
         Provider | None,
@@ -140,7 +140,7 @@ def sign(
     bundle_version: Annotated[
         int | None,
         typer.Option(
-            help="Devices refuse versions below one they have run; default: seconds since 1970.",
+            help="Devices reject versions below one they have run; default: seconds since 1970.",
             show_default=False,
         ),
     ] = None,

@@ -77,7 +77,9 @@ def plot(
     confidence: Annotated[float, typer.Option(help="A confidence stored in the bundle.")] = 0.9,
     scope: Annotated[
         Scope,
-        typer.Option(help="Whether it holds for each degree of freedom or for all six at once."),
+        typer.Option(
+            help="Whether the confidence holds per degree of freedom or for all six at once."
+        ),
     ] = "marginal",
 ) -> None:
     """Plot truth, point and bands of each degree of freedom, and x against y."""
@@ -101,7 +103,7 @@ def render(
     folder: Annotated[Path, typer.Argument(help="New folder.", show_default=False)],
     sequence: Annotated[str, typer.Option(help="Name of one sequence.")],
     frames: Annotated[
-        int | None, typer.Option(min=1, help="Only the first frames, this many.")
+        int | None, typer.Option(min=1, help="Number of frames, from the first; default: all.")
     ] = None,
 ) -> None:
     """Write one sequence as a 7-Scenes folder: JPEG images and .pose.txt."""

@@ -29,7 +29,9 @@ from cvo_export.vocabulary import StudyEngine
 @app.command()
 def compare(
     dataset: DatasetArgument,
-    out: Annotated[Path, typer.Argument(help="New folder, or that of an interrupted comparison.")],
+    out: Annotated[
+        Path, typer.Argument(help="New folder, or the folder of an interrupted comparison.")
+    ],
     methods: Annotated[
         str | None,
         typer.Option(help="Names separated by commas; default: all methods and baselines."),
@@ -86,7 +88,7 @@ def compare(
 @app.command()
 def study(
     config: Annotated[Path, typer.Argument(help="Grids to run, TOML.", show_default=False)],
-    out: Annotated[Path, typer.Argument(help="New folder, or that of a study to go on with.")],
+    out: Annotated[Path, typer.Argument(help="New folder, or the folder of a study to resume.")],
     engine: Annotated[
         StudyEngine, typer.Option(help="Processes of this machine, or a Ray cluster.")
     ] = "local",

@@ -55,7 +55,7 @@ def _train(
     light: Annotated[
         float | None,
         typer.Option(
-            min=0, help="Changes of light in the copies, 0 to 1; default: 1.", rich_help_panel=DATA
+            min=0, help="Lighting changes in the copies, 0 to 1; default: 1.", rich_help_panel=DATA
         ),
     ] = None,
     cache: Annotated[
@@ -72,7 +72,7 @@ def _train(
     normalisation: Annotated[
         Normalisation | None,
         typer.Option(
-            help="Pixel scaling; default: half, (x - 127.5)/127.5, for a file, else timm's.",
+            help="Pixel scaling; default: half, (x - 127.5)/127.5, for a file, otherwise timm's.",
             rich_help_panel=NETWORK,
         ),
     ] = None,
@@ -86,14 +86,14 @@ def _train(
     ] = "none",
     seed: Annotated[
         int,
-        typer.Option(min=0, help="Of split, training and noise.", rich_help_panel=TRAINING),
+        typer.Option(min=0, help="Seed of split, training and noise.", rich_help_panel=TRAINING),
     ] = 0,
     steps: StepsOption = None,
     fine_tune: Annotated[
         int | None,
         typer.Option(
             min=0,
-            help="Epochs in which the backbone learns as well; default: 0, frozen.",
+            help="Epochs that also train the backbone; default: 0, frozen.",
             rich_help_panel=TRAINING,
         ),
     ] = None,

@@ -114,7 +114,7 @@ def cached_copies(
 ) -> tuple[NDArray[np.float16], Array]:
     """Features (copies + 1, n, size) and poses (copies + 1, n, 7); copy 0 is not augmented.
 
-    Each copy is a file of its own, written atomically, so that an interrupted run resumes with
+    Each copy is a separate file, written atomically, so that an interrupted run resumes with
     the next copy.
     """
     features, poses = [], []

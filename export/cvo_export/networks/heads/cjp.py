@@ -62,7 +62,7 @@ class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unkno
     latent: Annotated[
         Latent,
         Meta(
-            description="What inference takes from the latent: its mean, the average over a "
+            description="Latent that inference uses: the mean, the average over a "
             "codebook of 16, or a seeded sample (the paper)."
         ),
     ] = "mean"
@@ -103,7 +103,7 @@ class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unkno
     ] = 1e-3
     feature_noise: FeatureNoise = 0.1
     dropout: Annotated[
-        float, Meta(ge=0, lt=1, description="Dropout behind the hidden layers while training.")
+        float, Meta(ge=0, lt=1, description="Dropout after the hidden layers during training.")
     ] = 0.0
     members: Annotated[
         int,

@@ -67,8 +67,8 @@ class CqrConfig(Struct, frozen=True, tag="cqr", tag_field="method", forbid_unkno
         tuple[float, float],
         Meta(description="Levels of lower and upper bound before conformalising."),
     ] = (0.05, 0.95)
-    trees: Annotated[int, Meta(ge=1, le=10_000, description="Trees of the forest.")] = 100
-    leaf_size: Annotated[int, Meta(ge=1, description="Least number of rows in a leaf.")] = 10
+    trees: Annotated[int, Meta(ge=1, le=10_000, description="Number of trees in the forest.")] = 100
+    leaf_size: Annotated[int, Meta(ge=1, description="Minimum number of rows in a leaf.")] = 10
     split_features: Annotated[
         float, Meta(gt=0, le=1, description="Share of the inputs tried at each split.")
     ] = 1 / 3

@@ -55,7 +55,7 @@ class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unkno
         Meta(
             ge=2,
             le=256,
-            description="Classes of each degree of freedom (K); fewer where training poses repeat.",
+            description="Classes per degree of freedom (K); fewer if training poses repeat.",
         ),
     ] = 128
     labels: Annotated[
@@ -72,7 +72,7 @@ class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unkno
     hidden: Hidden = (256, 128)
     feature_noise: FeatureNoise = 0.1
     dropout: Annotated[
-        float, Meta(ge=0, lt=1, description="Dropout behind the hidden layers while training.")
+        float, Meta(ge=0, lt=1, description="Dropout after the hidden layers during training.")
     ] = 0.0
 
 

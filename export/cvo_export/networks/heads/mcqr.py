@@ -83,13 +83,13 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
     ] = "none"
     passes: Annotated[
         Annotated[int, Meta(ge=1, le=1000)] | None,
-        Meta(description="Stochastic passes of each frame; 20 with augmentation."),
+        Meta(description="Stochastic passes per frame; 20 with augmentation."),
     ] = None
     dropout: Annotated[
         Annotated[float, Meta(ge=0, lt=1)] | None,
         Meta(
-            description="Dropout behind the point network's last hidden layer; if not given, 0.05 "
-            "with augmentation, else 0."
+            description="Dropout after the point network's last hidden layer; if not given, 0.05 "
+            "with augmentation, otherwise 0."
         ),
     ] = None
     components: Annotated[int, Meta(ge=0, le=4096, description=COMPONENTS)] = 16
@@ -119,7 +119,7 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
     ] = 0.01
     condition_noise: Annotated[
         float,
-        Meta(ge=0, description="Deviation of the noise added to the condition while training."),
+        Meta(ge=0, description="Deviation of the noise added to the condition during training."),
     ] = 0.05
     residuals: Residuals = "auto"
     hidden: Hidden = (256, 128)

@@ -37,7 +37,7 @@ COMPONENTS = "Principal components of the features that the model sees besides t
 Hidden = Annotated[tuple[int, int], Meta(description="Widths of the two hidden layers.")]
 FeatureNoise = Annotated[
     float,
-    Meta(ge=0, description="Deviation of the noise added to the features while training."),
+    Meta(ge=0, description="Deviation of the noise added to the features during training."),
 ]
 
 # With fewer training frames, too few remain if some are set aside for the residual models.
