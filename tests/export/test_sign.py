@@ -226,8 +226,8 @@ def test_both_command_lines(copied_bundle, clip_dir, keys, tmp_path):
     secret, public = keys
 
     def program(name, *arguments):
-        module = {"cvo-edge": "cvo_edge", "cvo-export": "cvo_export"}[name]
-        code = f"from {module}.cli import main; main()"
+        module = {"cvo-edge": "cvo_edge.__main__", "cvo-export": "cvo_export.cli"}[name]
+        code = f"from {module} import main; main()"
         return subprocess.run(
             [sys.executable, "-c", code, *map(str, arguments)],
             capture_output=True,
