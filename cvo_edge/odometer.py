@@ -127,7 +127,7 @@ class Odometer:
     ) -> Odometer:
         """Load a bundle folder; parameters and errors are those of the class.
 
-        With a cache, e.g. ``ModelCache.default()``, the model is prepared for this machine once;
+        With a cache, e.g. ``ModelCache.default()``, the model is optimised for this machine once;
         later loads need a fraction of the time and memory, and results are bit-identical. With a
         public key (PEM, Ed25519), the bundle must be signed with that key, and older versions of it
         are rejected from then on.

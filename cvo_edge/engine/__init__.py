@@ -1,1 +1,1 @@
-"""Inference engines: sessions, the cache of prepared models, and loading a bundle."""
+"""Inference engines: sessions, the model cache, and loading a bundle."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from cvo_edge.bundle.format import MODEL_FILE, Calibration, ModelSpec, TensorSpec
 from cvo_edge.bundle.reading import Check, check_model_file, read_calibration_file, read_model
-from cvo_edge.engine.model_cache import ModelCache, PreparedModel, identity
+from cvo_edge.engine.model_cache import CachedModel, ModelCache, identity
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 from cvo_edge.heads import Head
@@ -29,24 +29,24 @@ class Bundle:
     head
         The method's score and set, built from the calibration.
     model
-        The model's bytes, whose sha256 matches the calibration, or the same model as prepared for
+        The model's bytes, whose sha256 matches the calibration, or the same model, optimised for
         this machine by a cache.
     """
 
     calibration: Calibration
     head: Head
-    model: bytes | PreparedModel
+    model: bytes | CachedModel
 
     @classmethod
-    def of(cls, calibration: Calibration, model: bytes | PreparedModel) -> Bundle:
+    def of(cls, calibration: Calibration, model: bytes | CachedModel) -> Bundle:
         """Check a calibration against its method, as ``read_bundle`` does, and build a bundle."""
         return cls(calibration, checked_head(calibration), model)
 
     @property
     def model_bytes(self) -> bytes:
-        """The model's bytes; raises UsageError if the bundle holds a prepared model instead."""
-        if isinstance(self.model, PreparedModel):
-            raise UsageError("bundle: holds a prepared model only; read it without a cache")
+        """The model's bytes; raises UsageError if the bundle holds a cached model instead."""
+        if isinstance(self.model, CachedModel):
+            raise UsageError("bundle: holds a cached model only; read it without a cache")
         return self.model
 
     def __repr__(self) -> str:
@@ -70,7 +70,7 @@ def read_bundle(
     folder
         Folder with ``model.onnx`` and ``calibration.json``.
     cache
-        Cache of models prepared for this machine; the first call for a model fills it. If the cache
+        Cache of models optimised for this machine; the first call for a model fills it. If the cache
         cannot be used, or the provider is not onnxruntime, the bundle holds the model's bytes.
     check
         An additional check, e.g. of a signature; called before the model is read.
@@ -90,17 +90,17 @@ def read_bundle(
     head = checked_head(calibration)
     if check is not None:
         check(path, calibration, content)
-    prepared = None if cache is None else prepared_model(cache, calibration)
-    if cache is not None and prepared is not None:
-        _check_original(path, calibration, cache, prepared)
-        return Bundle(calibration, head, prepared)
+    cached = None if cache is None else cached_model(cache, calibration)
+    if cache is not None and cached is not None:
+        _check_original(path, calibration, cache, cached)
+        return Bundle(calibration, head, cached)
     model = read_model(path, calibration)
     if cache is not None and calibration.model.provider == "onnxruntime":
-        prepared = _prepared_now(calibration, model, cache)
-    return Bundle(calibration, head, model if prepared is None else prepared)
+        cached = _cached_now(calibration, model, cache)
+    return Bundle(calibration, head, model if cached is None else cached)
 
 
-def prepared_model(cache: ModelCache, calibration: Calibration) -> PreparedModel | None:
+def cached_model(cache: ModelCache, calibration: Calibration) -> CachedModel | None:
     """Return the cached model of a calibration, or None; only onnxruntime models are cached."""
     if calibration.model.provider != "onnxruntime":
         return None
@@ -108,7 +108,7 @@ def prepared_model(cache: ModelCache, calibration: Calibration) -> PreparedModel
 
 
 def _check_original(
-    folder: Path, calibration: Calibration, cache: ModelCache, prepared: PreparedModel
+    folder: Path, calibration: Calibration, cache: ModelCache, cached: CachedModel
 ) -> None:
     """Raise BundleMismatchError if the bundle's own model file is not the calibrated one.
 
@@ -116,15 +116,13 @@ def _check_original(
     A file that has not changed since its last check is not read again.
     """
     model = folder / MODEL_FILE
-    if not cache.knows(prepared, model):
+    if not cache.knows(cached, model):
         before = identity(model)
         check_model_file(folder, calibration)
-        cache.remember(prepared, model, before)
+        cache.remember(cached, model, before)
 
 
-def _prepared_now(
-    calibration: Calibration, model: bytes, cache: ModelCache
-) -> PreparedModel | None:
+def _cached_now(calibration: Calibration, model: bytes, cache: ModelCache) -> CachedModel | None:
     """Build a cache entry; None if it cannot be stored or its results are not bit-identical."""
     new = cache.new_folder()
     if new is None:
@@ -140,16 +138,16 @@ def _prepared_now(
     # Two models in memory at once would set the peak of the whole run.
     del plain
     cache.keep(new, calibration.name, spec.sha256)
-    prepared = cache.find(spec.sha256)
-    if prepared is not None and not _same(prepared, spec, expected):
+    cached = cache.find(spec.sha256)
+    if cached is not None and not _same(cached, spec, expected):
         cache.forget(spec.sha256)
         return None
-    return prepared
+    return cached
 
 
-def _same(prepared: PreparedModel, spec: ModelSpec, expected: dict[str, np.ndarray]) -> bool:
+def _same(cached: CachedModel, spec: ModelSpec, expected: dict[str, np.ndarray]) -> bool:
     try:
-        found = Session(prepared, 1, spec).run(_feeds(spec.inputs))
+        found = Session(cached, 1, spec).run(_feeds(spec.inputs))
     except (ModelError, BundleMismatchError):
         return False
     return all(np.array_equal(found[name], values) for name, values in expected.items())
@@ -166,7 +164,7 @@ def _feeds(inputs: tuple[TensorSpec, ...]) -> dict[str, np.ndarray]:
 
 
 def open_session(
-    model: bytes | PreparedModel,
+    model: bytes | CachedModel,
     threads: int | None,
     expected: ModelSpec,
     *,
@@ -176,17 +174,17 @@ def open_session(
     """Open a session of the provider that the calibration names.
 
     ``at_once`` is the number of threads that call the session concurrently; see ``Session`` for the
-    other parameters. Raises BundleMismatchError if a prepared model was built from another model.
+    other parameters. Raises BundleMismatchError if a cached model was built from another model.
     """
-    if isinstance(model, PreparedModel) and (model.model_sha256, "onnxruntime") != (
+    if isinstance(model, CachedModel) and (model.model_sha256, "onnxruntime") != (
         expected.sha256,
         expected.provider,
     ):
         raise BundleMismatchError(
-            f"prepared model: expected sha256 {expected.sha256} for {expected.provider}, found "
+            f"cached model: expected sha256 {expected.sha256} for {expected.provider}, found "
             f"{model.model_sha256} for onnxruntime"
         )
-    if expected.provider == "openvino" and not isinstance(model, PreparedModel):
+    if expected.provider == "openvino" and not isinstance(model, CachedModel):
         # Imported here because the package is optional and large.
         from cvo_edge.engine.openvino import OpenvinoSession
 

@@ -1,4 +1,4 @@
-"""Cache of prepared models: what onnxruntime builds from a model on this machine.
+"""The model cache: the optimised form that onnxruntime builds from a model on this machine.
 
 Loading a model means parsing it, optimising its graph for this processor and rearranging its
 weights. The cache stores the result as a folder of two files: the optimised graph, and its weights,
@@ -75,7 +75,7 @@ class FileIdentity(Struct, frozen=True, array_like=True):
 
 
 @dataclass(frozen=True)
-class PreparedModel:
+class CachedModel:
     """A checked cache entry: the bytes of the graph, and the folder with the weights."""
 
     folder: Path
@@ -94,7 +94,7 @@ class Listed(Struct, frozen=True):
 
 
 class ModelCache:
-    """A folder of prepared models.
+    """A folder of models, optimised for this machine.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class ModelCache:
         """
         return cls(own_folder(CACHE_VARIABLE, "XDG_CACHE_HOME", "~/.cache"))
 
-    def find(self, model_sha256: str) -> PreparedModel | None:
+    def find(self, model_sha256: str) -> CachedModel | None:
         """Return the entry of a model, or None; a changed entry is removed."""
         if self.obstacle() is not None:
             return None
@@ -134,23 +134,23 @@ class ModelCache:
                 return None
             unchanged = False
         if unchanged:
-            return PreparedModel(folder, graph, model_sha256)
+            return CachedModel(folder, graph, model_sha256)
         self.forget(model_sha256)
         return None
 
-    def knows(self, prepared: PreparedModel, model: Path) -> bool:
+    def knows(self, cached: CachedModel, model: Path) -> bool:
         """Whether this model file is unchanged since its digest was checked."""
-        return identity(model) in _seen(prepared)
+        return identity(model) in _seen(cached)
 
-    def remember(self, prepared: PreparedModel, model: Path, before: FileIdentity | None) -> None:
+    def remember(self, cached: CachedModel, model: Path, before: FileIdentity | None) -> None:
         """Record a model file whose digest matched; ``before`` is its identity before the check."""
         if before is None or before != identity(model):
             return
         if time.time_ns() - max(before.ctime_ns, before.mtime_ns) < _SETTLED_NS:
             return
-        seen = [*_seen(prepared), before][-_MOST_SEEN:]
+        seen = [*_seen(cached), before][-_MOST_SEEN:]
         with contextlib.suppress(SinkError):
-            write_whole(prepared.folder / SEEN_FILE, msgspec.json.encode(seen))
+            write_whole(cached.folder / SEEN_FILE, msgspec.json.encode(seen))
 
     def new_folder(self) -> Path | None:
         """Create a folder for the files of a new entry; None if that is impossible."""
@@ -289,9 +289,9 @@ def identity(path: Path) -> FileIdentity | None:
     )
 
 
-def _seen(prepared: PreparedModel) -> list[FileIdentity]:
+def _seen(cached: CachedModel) -> list[FileIdentity]:
     try:
-        return msgspec.json.decode(_content(prepared.folder / SEEN_FILE), type=list[FileIdentity])
+        return msgspec.json.decode(_content(cached.folder / SEEN_FILE), type=list[FileIdentity])
     except (OSError, *_UNDECODABLE):
         return []
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import MAX_NUMBER, ModelSpec, PoseSpec, PreprocessSpec
 from cvo_edge.engine.loading import open_session
-from cvo_edge.engine.model_cache import PreparedModel
+from cvo_edge.engine.model_cache import CachedModel
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import UsageError
 from cvo_edge.estimate import Reason
@@ -66,7 +66,7 @@ class Observer:
     Parameters
     ----------
     model
-        The model's bytes, or its prepared form.
+        The model's bytes, or its cached form.
     spec, inputs, pose
         The calibration's description of the model, its input and the poses.
     head
@@ -86,7 +86,7 @@ class Observer:
 
     def __init__(
         self,
-        model: bytes | PreparedModel,
+        model: bytes | CachedModel,
         spec: ModelSpec,
         inputs: PreprocessSpec,
         pose: PoseSpec,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Dtype, ModelSpec, TensorSpec
 from cvo_edge.engine.cores import checked_threads, cores_of_threads
-from cvo_edge.engine.model_cache import GRAPH_FILE, WEIGHTS_FILE, PreparedModel
+from cvo_edge.engine.model_cache import GRAPH_FILE, WEIGHTS_FILE, CachedModel
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 
 # Nothing is sent over the network.
@@ -93,7 +93,7 @@ class Session:
     Parameters
     ----------
     model
-        The model's bytes or a prepared model, never a path: the bytes that run are those whose
+        The model's bytes or a cached model, never a path: the bytes that run are those whose
         digest was checked, and a model cannot open other files.
     threads
         Threads of one inference; all allowed cores by default.
@@ -103,7 +103,7 @@ class Session:
         Whether threads busy-wait for each other within an inference: faster, but uses more
         processor time.
     keep_in
-        Folder that the prepared model is written to, for a cache.
+        Folder that the cached model is written to, for a cache.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class Session:
 
     def __init__(
         self,
-        model: bytes | PreparedModel,
+        model: bytes | CachedModel,
         threads: int | None = None,
         expected: ModelSpec | None = None,
         *,
@@ -154,13 +154,13 @@ class Session:
             prefix = "session.optimized_model_external_initializers_"
             options.add_session_config_entry(prefix + "file_name", WEIGHTS_FILE)
             options.add_session_config_entry(prefix + "min_size_in_bytes", str(_SMALL_TENSOR))
-        if isinstance(model, PreparedModel):
+        if isinstance(model, CachedModel):
             content, weights = model.graph, str(model.folder)
             options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         else:
             # By default, a model's external data would be read from the current folder.
             content, weights = model, os.devnull
-            # Set for every precision; the graph of a prepared model already includes it.
+            # Set for every precision; the graph of a cached model already includes it.
             if saturates():
                 options.add_session_config_entry("session.x64quantprecision", "1")
         key = "session.model_external_initializers_file_folder_path"

@@ -66,7 +66,7 @@ def verify_bundle(
 ) -> Verdict:
     """Check the digests of a bundle, load it and run its self-test, in a child process.
 
-    The self-test runs on the model itself and, if the cache holds one, on its prepared model. With
+    The self-test runs on the model itself and, if the cache holds one, on its cached form. With
     a public key, the signature and the version are checked, too: the version must not be older than
     one that this device has run.
 
@@ -163,7 +163,7 @@ def _selftest(
     folder: str, threads: int | None, timeout_s: float, public_key: str | None
 ) -> Verdict:
     from cvo_edge.engine.cores import checked_threads
-    from cvo_edge.engine.loading import Bundle, prepared_model, read_bundle
+    from cvo_edge.engine.loading import Bundle, cached_model, read_bundle
     from cvo_edge.engine.model_cache import ModelCache
     from cvo_edge.odometer import Odometer
     from cvo_edge.programs.selftest import check_selftest
@@ -177,9 +177,9 @@ def _selftest(
     calibration = bundle.calibration
     _limit(len(bundle.model_bytes), checked_threads(threads), timeout_s)
     forms = [bundle]
-    prepared = prepared_model(ModelCache.default(), calibration)
-    if prepared is not None:
-        forms.append(Bundle(calibration, bundle.head, prepared))
+    cached = cached_model(ModelCache.default(), calibration)
+    if cached is not None:
+        forms.append(Bundle(calibration, bundle.head, cached))
     first, worst = calibration.thresholds[0], 0.0
     for form in forms:
         with Odometer(

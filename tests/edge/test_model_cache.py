@@ -19,8 +19,8 @@ from cvo_edge.engine.model_cache import (
     GRAPH_FILE,
     SEEN_FILE,
     WEIGHTS_FILE,
+    CachedModel,
     ModelCache,
-    PreparedModel,
     file_digests,
 )
 from cvo_edge.engine.session import Session
@@ -57,7 +57,7 @@ def test_a_prepared_model_computes_the_very_same(method, bundle_dir, clip_dir, c
             for other in others:
                 for name, values in expected.outputs.items():
                     assert np.array_equal(values, other.outputs[name])
-    assert isinstance(read_bundle(folder, cache=cache).model, PreparedModel)
+    assert isinstance(read_bundle(folder, cache=cache).model, CachedModel)
 
 
 def test_what_is_prepared_is_the_same_whatever_a_calibration_says_of_it(
@@ -87,7 +87,7 @@ def test_a_changed_byte_is_never_used(file, bundle_dir, bundle, cache):
     path.write_bytes(content)
     assert cache.find(sha256) is None
     assert not path.exists()
-    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, CachedModel)
     assert cache.find(sha256) is not None
 
 
@@ -107,21 +107,21 @@ def test_what_is_no_file_is_neither_waited_for_nor_followed(file, make, bundle_d
     path.unlink(missing_ok=True)
     make(path)
     cache_lines(cache)
-    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, CachedModel)
     assert cache.find(bundle.calibration.model.sha256) is not None
 
 
 def test_what_is_prepared_is_of_this_model_and_this_engine(bundle_dir, bundle, cache):
     """Two bundles may agree in all names and shapes; neither runs with the other's model."""
-    prepared = read_bundle(bundle_dir, cache=cache).model
+    cached = read_bundle(bundle_dir, cache=cache).model
     eight = read_bundle(bundle_dir.with_name("synthetic-room-cjp-int8")).calibration
     elsewhere = msgspec.structs.replace(
         bundle.calibration,
         model=msgspec.structs.replace(bundle.calibration.model, provider="openvino"),
     )
     for calibration in (eight, elsewhere):
-        with pytest.raises(BundleMismatchError, match="prepared model: expected"):
-            Odometer(Bundle.of(calibration, prepared))
+        with pytest.raises(BundleMismatchError, match="cached model: expected"):
+            Odometer(Bundle.of(calibration, cached))
 
 
 def test_verify_asks_the_prepared_model_too(bundle_dir, cache, monkeypatch):
@@ -220,7 +220,7 @@ def test_a_folder_that_others_may_write_to_is_not_used(bundle_dir, cache):
     cache.folder.chmod(0o777)
     assert isinstance(read_bundle(bundle_dir, cache=cache).model, bytes)
     cache.folder.chmod(0o700)
-    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, CachedModel)
 
 
 def test_a_cache_that_cannot_be_made_costs_nothing_but_itself(bundle_dir, tmp_path):
@@ -395,9 +395,9 @@ def test_an_entry_that_is_no_text_costs_its_advantage_only(content, bundle_dir, 
     path.write_bytes(content)
     assert cache.entries() == []
     assert cache.find(bundle.calibration.model.sha256) is None
-    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, CachedModel)
     (entry_folder(cache) / SEEN_FILE).write_bytes(content)
-    assert isinstance(read_bundle(bundle_dir, cache=cache).model, PreparedModel)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, CachedModel)
 
 
 def test_a_model_that_has_grown_beyond_its_limit_is_refused_at_once(copied_bundle, cache):
