@@ -70,7 +70,7 @@ def read_bundle(
     folder
         Folder with ``model.onnx`` and ``calibration.json``.
     cache
-        Cache of models optimised for this machine; the first call for a model fills it. If the cache
+        Cache of models optimised for this machine; the first call for a model fills it. If it
         cannot be used, or the provider is not onnxruntime, the bundle holds the model's bytes.
     check
         An additional check, e.g. of a signature; called before the model is read.
