@@ -28,7 +28,8 @@ def tiny_config(**changes: Any) -> TrainConfig:
         "split": "random",
         "height": 48,
         "width": 64,
-        "backbone": BackboneConfig(stages=("16",), grid=(3, 4)),
+        # Its graph exports in a third of the time of a MobileNetV2.
+        "backbone": BackboneConfig("test_efficientnet", stages=("16",), grid=(3, 4)),
         "weights": "none",
         "augment": AugmentConfig(2.0, 0.5),
         "copies": 2,

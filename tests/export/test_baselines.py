@@ -42,7 +42,7 @@ Z = norm.ppf(0.95)
 
 def config_of(name):
     # An early stage and few units keep graphs and checkpoints small.
-    backbone = BackboneConfig(stages=("8",), grid=(3, 4))
+    backbone = BackboneConfig("test_efficientnet", stages=("8",), grid=(3, 4))
     return tiny_config(head=BASELINES[name].config(hidden=(64, 32)), backbone=backbone)
 
 

@@ -32,13 +32,15 @@ def options(tmp_path_factory):
     """Options of the grid; runs share features only if their weights come from a file."""
     path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
     torch.manual_seed(5)
-    body = Backbone(BackboneConfig(stages=("8",), grid=(3, 4)), 48, 64).body
+    config = BackboneConfig("test_efficientnet", stages=("8",), grid=(3, 4))
+    body = Backbone(config, 48, 64).body
     save_file(body.state_dict(), path)
     return {
         "data": [DATASET],
         "methods": METHODS,
         "seeds": 2,
         "split": "random",
+        "backbones": ["test_efficientnet"],
         "size": "64x48",
         "weights": str(path),
         "stages": "8",

@@ -27,6 +27,7 @@ GRID = """
 data = ["$CVO_TEST_DATA"]
 split = "random"
 methods = ["cjp"]
+backbones = ["test_efficientnet"]
 weights = "none"
 size = "64x48"
 copies = 1
@@ -212,7 +213,7 @@ def test_names_of_cells_depend_on_no_place(studied, monkeypatch, tmp_path):
         (CONFIG.replace("sharpness = [0.5", "dropout = [2.0"), "grid sharpness: .*dropout"),
         (CONFIG.replace('["cjp"]', '["cjp", "cjp"]'), "methods: expected each value once"),
         (CONFIG.replace('"none"', '"/nowhere.safetensors"'), "expected a safetensors file"),
-        (CONFIG.replace("copies", 'backbones = ["a/b"]\ncopies'), "expected a timm model"),
+        (CONFIG.replace("test_efficientnet", "a/b"), "expected a timm model"),
         (CONFIG.replace("$CVO_TEST_DATA", DATASET.split(",")[0] + ",flights=1,frames=20"), "val"),
         (CONFIG.replace("speckle:0.3", "rain"), "expected NAME or NAME:STRENGTH"),
         (CONFIG.replace('["cjp"]', '["abc"]'), "expected one of cjp"),

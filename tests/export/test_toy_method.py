@@ -18,7 +18,18 @@ from . import toy_network
 from .conftest import DATASET
 from .toy_head import ToyHead
 
-SMALL = ["--weights", "none", "--size", "64x48", "--copies", "1", "--steps", "100"]
+SMALL = [
+    "--backbone",
+    "test_efficientnet",
+    "--weights",
+    "none",
+    "--size",
+    "64x48",
+    "--copies",
+    "1",
+    "--steps",
+    "100",
+]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -86,13 +97,14 @@ def test_compare_and_the_report_of_a_study_hold_it(bundle, tmp_path):
     table = call(
         training.app,
         *("compare", DATASET, tmp_path / "compare", "--methods", "toy,split", "--seeds", "1"),
-        *("--split", "random", "--jobs", "1", "--weights", "none", "--copies", "1"),
-        *("--steps", "100"),
+        *("--backbone", "test_efficientnet", "--split", "random", "--jobs", "1"),
+        *("--weights", "none", "--copies", "1", "--steps", "100"),
     )
     assert any(line.startswith("toy") for line in table.splitlines())
     (tmp_path / "study.toml").write_text(
         'title = "Toys"\n[[grids]]\nname = "toys"\nmethods = ["toy"]\nseeds = 1\n'
-        f'data = ["{DATASET}"]\nsplit = "random"\nweights = "none"\nsize = "64x48"\n'
+        f'data = ["{DATASET}"]\nsplit = "random"\nbackbones = ["test_efficientnet"]\n'
+        'weights = "none"\nsize = "64x48"\n'
         "copies = 1\nsteps = 100\n"
     )
     call(training.app, "study", tmp_path / "study.toml", tmp_path / "study", "--jobs", "1")
