@@ -1,4 +1,4 @@
-"""What every reader holds to, and what a person is told of a data set."""
+"""Common behaviour of the readers, and the description of a data set."""
 
 import subprocess
 import sys
@@ -19,7 +19,7 @@ IDENTITY = np.array([0, 0, 0, 0, 0, 0, 1.0])
 
 
 def tum_sequence(folder):
-    """Three frames: one with everything, one without an image, one without a pose."""
+    """Write three frames: one complete, one without an image, one without a pose."""
     (folder / "rgb").mkdir(parents=True)
     (folder / "rgb.txt").write_text("1.0 rgb/1.png\n2.0 rgb/2.png\n3.0 rgb/3.png\n")
     (folder / "groundtruth.txt").write_text("1.0 0.5 0 -1 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
@@ -89,10 +89,10 @@ def test_an_image_that_vanished_or_is_damaged_names_its_file(tmp_path):
     frames = FrameList(tmp_path)
     frames.add("a", "1", image, IDENTITY)
     read_image = frames.dataset("x").read_image
-    with pytest.raises(SourceError, match=r"1.png: expected a whole image, found a damaged one"):
+    with pytest.raises(SourceError, match=r"1.png: expected an image, found a damaged or"):
         read_image(0)
     image.unlink()
-    with pytest.raises(SourceError, match=r"1.png: expected an image, found that it cannot be"):
+    with pytest.raises(SourceError, match=r"1.png: expected an image; the file cannot be read"):
         read_image(0)
     with pytest.raises(IndexError):
         read_image(1)
@@ -115,7 +115,7 @@ def test_an_empty_file_has_no_rows(tmp_path):
 
 
 def test_a_folder_is_no_file(tmp_path):
-    with pytest.raises(SourceError, match=r"expected a file of x y, found that it cannot be read"):
+    with pytest.raises(SourceError, match=r"expected a file of x y, but it cannot be read"):
         read_rows(tmp_path, "x y")
 
 

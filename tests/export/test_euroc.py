@@ -1,4 +1,4 @@
-"""EuRoC: the body's pose becomes the camera's; the same poses as evo's, before and after."""
+"""EuRoC: body poses are converted to camera poses; evo reads the same poses, before and after."""
 
 import shutil
 from pathlib import Path
@@ -14,7 +14,7 @@ from cvo_export.datasets import open_dataset
 from cvo_export.datasets.euroc import open_euroc
 
 DATA = Path(__file__).parent / "data" / "euroc"
-# The same stamps as in groundtruth.csv, some of which are off by a few nanoseconds.
+# The stamps of groundtruth.csv, some of which differ from the images' by a few nanoseconds.
 FIRST_NS, STEP_NS = 1403715274302142976, 5_000_000
 ONES = ("[" + "1, " * 99)[:80]
 IDENTITY = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
@@ -79,7 +79,7 @@ def test_the_quaternion_is_scalar_first_and_the_camera_sits_on_the_body(tmp_path
     folder = recording(tmp_path / "a", [FIRST_NS])
     turn = Rotation.from_rotvec([0.3, -0.5, 2.9])
     x, y, z, w = turn.as_quat()
-    truth(folder).write_text(f"{FIRST_NS},1,2,3,{w},{x},{y},{z}\n")  # eight columns will do
+    truth(folder).write_text(f"{FIRST_NS},1,2,3,{w},{x},{y},{z}\n")  # eight columns are enough
     text = sensor(folder).read_text()
     numbers = text[text.index("[") + 1 : text.index("]")].split(",")
     T_BS = np.array(numbers, dtype=float).reshape(4, 4)
@@ -109,7 +109,7 @@ def test_the_first_line_of_opencv_is_passed_over(tmp_path):
 def test_intrinsics_of_no_camera_are_refused(tmp_path, number):
     folder = recording(tmp_path / "a", stamps(1))
     edit(sensor(folder), "40.5", number)
-    with pytest.raises(SourceError, match=r"sensor.yaml: expected intrinsics of a camera, found"):
+    with pytest.raises(SourceError, match=r"sensor.yaml: expected finite intrinsics with"):
         open_euroc(str(folder))
 
 
@@ -161,23 +161,24 @@ def test_recordings_of_one_room_are_one_data_set(tmp_path):
     with pytest.raises(SourceError) as refusal:
         open_euroc(str(room))
     assert str(refusal.value) == (
-        f"{room}: expected sequences of one camera, found V1_01_easy and V1_02_medium of two"
+        f"{room}: expected sequences from one camera, found different cameras in V1_01_easy and "
+        "V1_02_medium"
     )
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("\t: [", "YAML with T_BS and intrinsics, found none"),
-        ("text", "YAML with T_BS and intrinsics, found none"),
-        ("date: 2014-13-45", "YAML with T_BS and intrinsics, found none"),
-        ("[" * 3000, "YAML with T_BS and intrinsics, found none"),
-        (f"T_BS: [{', '.join('1' * 99)}]", f"T_BS, 16 numbers of a rigid motion, found {ONES}"),
-        ("a: 1", "T_BS, 16 numbers of a rigid motion, found None"),
-        ("T_BS: [1, 2]", "T_BS, 16 numbers of a rigid motion, found [1, 2]"),
+        ("\t: [", "YAML with T_BS and intrinsics, found other text"),
+        ("text", "YAML with T_BS and intrinsics, found other text"),
+        ("date: 2014-13-45", "YAML with T_BS and intrinsics, found other text"),
+        ("[" * 3000, "YAML with T_BS and intrinsics, found other text"),
+        (f"T_BS: [{', '.join('1' * 99)}]", f"T_BS, 16 numbers of a rigid transform, found {ONES}"),
+        ("a: 1", "T_BS, 16 numbers of a rigid transform, found None"),
+        ("T_BS: [1, 2]", "T_BS, 16 numbers of a rigid transform, found [1, 2]"),
         (
             "T_BS: {data: [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}",
-            "T_BS, 16 numbers of a rigid motion, found "
+            "T_BS, 16 numbers of a rigid transform, found "
             "{'data': [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}",
         ),
     ],
@@ -231,5 +232,5 @@ def test_no_recording_is_refused(tmp_path):
     with pytest.raises(SourceError) as refusal:
         open_euroc(str(tmp_path))
     assert str(refusal.value) == (
-        f"{tmp_path}: expected mav0/cam0/data.csv, or folders that hold it, found neither"
+        f"{tmp_path}: expected mav0/cam0/data.csv, or folders that contain it, found neither"
     )

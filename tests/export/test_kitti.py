@@ -1,4 +1,4 @@
-"""KITTI odometry: poses of the camera whose images are read; the same poses as evo's."""
+"""KITTI odometry: poses belong to the camera whose images are read; evo reads the same poses."""
 
 import shutil
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_poses_are_those_of_the_camera_read_as_evo_has_them(tmp_path, cameras, r
     evo = np.loadtxt(DATA / f"evo_{reference}.kitti").reshape(-1, 3, 4)
     assert len(found) == 12
     assert not found.skipped
-    # Seven digits in the file: rotations are orthonormal to that.
+    # The file has seven digits, so rotations are orthonormal only to that precision.
     np.testing.assert_allclose(matrices(found.poses), evo, atol=2e-6)
     np.testing.assert_allclose(np.linalg.norm(found.poses[:, 3:], axis=1), 1, atol=1e-12)
     assert (found.poses[:, 6] >= 0).all()
@@ -92,7 +92,7 @@ def test_several_sequences_are_refused_by_name(tmp_path):
     with pytest.raises(SourceError) as refusal:
         open_kitti(str(tmp_path))
     assert str(refusal.value) == (
-        f"{tmp_path}: expected one sequence with poses, as each has a world frame of its own, "
+        f"{tmp_path}: expected one sequence with poses, because each has its own world frame, "
         f"found 00, 01; choose one, e.g. {first}"
     )
 

@@ -1,4 +1,4 @@
-"""RGB-D Scenes v2: scalar-first quaternions, one world a scene, what is skipped and refused."""
+"""RGB-D Scenes v2: scalar-first quaternions, one world per scene, skipped and refused input."""
 
 import cv2
 import numpy as np
@@ -10,7 +10,7 @@ from cvo_edge.pose import Pose
 from cvo_export.datasets import open_dataset
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
 
-TURN = Rotation.from_rotvec([0.3, -0.5, 2.9])  # large: the components of its quaternion differ
+TURN = Rotation.from_rotvec([0.3, -0.5, 2.9])  # all quaternion components differ
 X, Y, Z, W = TURN.as_quat()
 LINES = [
     "1 0 0 0 0 0 0",
@@ -41,10 +41,10 @@ def test_a_line_is_a_scalar_first_quaternion_then_a_position(tmp_path, end):
     T = Pose.from_array(found.poses[1]).to_matrix()
     np.testing.assert_allclose(T[:3, :3], TURN.as_matrix(), atol=2e-6)
     np.testing.assert_array_equal(T[:3, 3], [0.5, -0.25, 1.5])
-    # The camera looks along its z axis: a point one metre ahead, in the world.
+    # The camera looks along its z axis, so this point is one metre ahead of it.
     ahead = np.add(TURN.apply([0, 0, 1]), [0.5, -0.25, 1.5])
     np.testing.assert_allclose((T @ [0, 0, 1, 1])[:3], ahead, atol=2e-6)
-    # Both signs of a quaternion are one rotation, read with qw >= 0.
+    # Both signs of a quaternion are the same rotation, which is read with qw >= 0.
     np.testing.assert_allclose(found.poses[2][3:], found.poses[1][3:], atol=1e-12)
     assert (found.poses[:, 6] >= 0).all()
     np.testing.assert_allclose(np.linalg.norm(found.poses[:, 3:], axis=1), 1, atol=1e-12)
@@ -69,7 +69,7 @@ def test_several_scenes_are_refused_by_name(tmp_path):
     with pytest.raises(SourceError) as refusal:
         open_rgbd_scenes(str(tmp_path))
     assert str(refusal.value) == (
-        f"{tmp_path}: expected one scene imgs/scene_NN, as each has a world frame of its own, "
+        f"{tmp_path}: expected one scene imgs/scene_NN, because each has its own world frame, "
         f"found scene_01, scene_02; choose one, e.g. {first}"
     )
 
@@ -79,7 +79,7 @@ def test_frames_without_counterpart_and_invalid_poses_are_skipped_and_counted(tm
     folder = scene(tmp_path, lines=lines, images=9)
     (folder / "00001-color.png").unlink()
     found = open_rgbd_scenes(str(folder))
-    # Frame numbers, not places in a listing, say which line is whose.
+    # Lines are matched to images by frame number, not by position in the listing.
     assert found.frame_names == ("scene_01/00000", "scene_01/00002")
     np.testing.assert_array_equal(found.poses[1][:3], [1, 2, 3])
     assert found.skipped == {"image missing": 1, "invalid pose": 4, "no pose": 2}

@@ -1,4 +1,4 @@
-"""The 7-Scenes layout: what is read, skipped and counted; writing gives it back."""
+"""The 7-Scenes layout: reading, skipping and counting frames; writing and reading round-trip."""
 
 import cv2
 import numpy as np
@@ -64,7 +64,7 @@ def test_intrinsics_are_read_or_scaled_from_the_nominal_ones(tmp_path):
     with pytest.raises(SourceError, match="nine numbers"):
         open_seven_scenes(str(root))
     (root / "camera-intrinsics.txt").write_text("-50 0 31\n0 51 23\n0 0 1\n")
-    with pytest.raises(SourceError, match="expected intrinsics of a camera"):
+    with pytest.raises(SourceError, match="expected finite intrinsics with positive focal"):
         open_seven_scenes(str(root))
 
 
@@ -75,7 +75,7 @@ def test_one_sequence_folder_is_a_data_set(tmp_path):
 
 
 def test_nothing_to_read_is_refused(tmp_path):
-    with pytest.raises(SourceError, match="found none"):
+    with pytest.raises(SourceError, match="expected a 7-Scenes folder, found no folder"):
         open_seven_scenes(str(tmp_path / "nowhere"))
     with pytest.raises(SourceError, match="expected frames with a pose"):
         open_seven_scenes(str(tmp_path))

@@ -1,4 +1,4 @@
-"""Laws of the synthetic data set: reproducible, prefix-stable, and where its flights go."""
+"""Laws of the synthetic data set: reproducibility, stable prefixes, and the flights' volume."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIZE = (160, 120)
 
 @pytest.fixture(scope="module")
 def flights():
-    """Many poses; their images are not needed."""
+    """Many flights, of which only the poses are used."""
     return open_room("room,flights=40,frames=60,size=160x120")
 
 
@@ -30,7 +30,7 @@ def flights():
 
 
 def test_default_is_48_flights_of_50_frames():
-    """The bare name asks for the documented sizes; nothing is rendered to answer."""
+    """The bare name gives the documented sizes, without rendering."""
     dataset = open_room()
     assert dataset.name == "synthetic-room"
     assert len(dataset) == 48 * 50 == len(dataset.frame_names) == len(set(dataset.frame_names))
@@ -44,21 +44,21 @@ def test_default_is_48_flights_of_50_frames():
 
 
 def test_poses_are_unit_quaternions(flights):
-    """Each pose is finite, float64, and its quaternion has norm one."""
+    """Poses are finite float64 numbers with quaternions of norm 1."""
     assert flights.poses.shape == (2400, 7)
     assert flights.poses.dtype == np.float64
     assert np.allclose(np.linalg.norm(flights.poses[:, 3:], axis=1), 1, atol=1e-12)
 
 
 def test_images_have_the_size_asked_for():
-    """Images are uint8 BGR of the requested width and height, also at odd sizes."""
+    """Images are uint8 BGR of the requested size, including odd sizes."""
     image = open_room("room,flights=1,frames=1,size=101x63").read_image(0)
     assert image.shape == (63, 101, 3)
     assert image.dtype == np.uint8
 
 
 def test_opening_paints_nothing():
-    """Neither importing nor opening builds the textures: reading the first image does."""
+    """The textures are built when the first image is read, not on import or open."""
     code = (
         "from cvo_export.datasets.synthetic import open_room; d = open_room();"
         "from cvo_export.scene.room import room; assert room.cache_info().currsize == 0;"
@@ -95,7 +95,7 @@ def test_opening_paints_nothing():
     ],
 )
 def test_bad_specification_is_refused(spec, expected, found):
-    """One line names what was expected and what was found."""
+    """One line states what was expected and what was found."""
     with pytest.raises(UsageError) as error:
         open_room(spec)
     message = str(error.value)
@@ -105,7 +105,7 @@ def test_bad_specification_is_refused(spec, expected, found):
 
 
 def test_frame_past_the_end_is_an_index_error():
-    """There is no frame after the last one."""
+    """Reading past the last frame raises IndexError."""
     with pytest.raises(IndexError):
         open_room(SMALL).read_image(12)
 
@@ -114,7 +114,7 @@ def test_frame_past_the_end_is_an_index_error():
 
 
 def test_images_are_identical_in_any_order_and_thread():
-    """A frame's bytes depend on its number alone."""
+    """A frame's bytes depend only on its number."""
     first, second = open_room(SMALL), open_room(SMALL)
     forwards = [first.read_image(i) for i in range(12)]
     with ThreadPoolExecutor(2) as pool:
@@ -153,7 +153,7 @@ def test_flights_fill_the_documented_volume(flights):
 
 
 def test_camera_looks_forward_within_its_limits(flights):
-    """Yaw stays within 17.5, pitch within 7.5, roll within 4 degrees, and all of it is used."""
+    """Flights use the whole ranges of yaw (17.5), pitch (7.5) and roll (4 degrees), but no more."""
     right, _, forward = np.moveaxis(quaternion_to_matrix(flights.poses[:, 3:]), -1, 0)
     yaw = np.degrees(np.arctan2(-forward[:, 0], forward[:, 1]))
     pitch = np.degrees(np.arcsin(forward[:, 2]))
@@ -163,7 +163,7 @@ def test_camera_looks_forward_within_its_limits(flights):
 
 
 def test_motion_is_smooth_and_slow(flights):
-    """A frame moves about 1.6 cm and 0.6 degrees on, and velocity changes little between frames."""
+    """The camera moves about 1.6 cm and 0.6 degrees per frame, and its velocity changes slowly."""
     poses = flights.poses.reshape(40, 60, 7)
     step = np.diff(poses[..., :3], axis=1)
     dot = np.abs(np.sum(poses[:, 1:, 3:] * poses[:, :-1, 3:], axis=-1)).clip(0, 1)
@@ -173,7 +173,7 @@ def test_motion_is_smooth_and_slow(flights):
 
 
 def test_every_flight_starts_within_the_others_volume(flights):
-    """New flights interpolate: around each first pose, other flights have been within 10 cm."""
+    """New flights interpolate: other flights pass within 10 cm of each first pose."""
     position = flights.poses[:, :3].reshape(40, 60, 3)
     near = []
     for number, start in enumerate(position[:, 0]):
@@ -184,18 +184,18 @@ def test_every_flight_starts_within_the_others_volume(flights):
 
 
 def test_camera_keeps_its_distance_from_everything():
-    """No point of the flights' volume is within 0.9 m of a wall or of furniture, or inside it."""
+    """Every point of the flights' volume is at least 0.9 m from walls and furniture."""
     axes = [np.linspace(a, b, 9) for a, b in ((-0.4, 0.4), (-0.7, -0.1), (1.15, 1.45))]
     volume = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
     clearance = np.inf
     for corner, u, v, _ in room().faces:
-        # The nearest point of a rectangle: clamp the coordinates along its two sides.
+        # Clamping the coordinates along both sides gives the nearest point of a rectangle.
         a = ((volume - corner) @ u / (u @ u)).clip(0, 1)
         b = ((volume - corner) @ v / (v @ v)).clip(0, 1)
         nearest = corner + a[:, None] * u + b[:, None] * v
         clearance = min(clearance, np.linalg.norm(volume - nearest, axis=1).min())
     assert clearance >= 0.9
-    # No surface cuts the volume: it lies inside the room, and no furniture is large enough for it.
+    # The volume lies inside the room, and no furniture is large enough to contain it.
     assert (np.abs(volume[:, :2]) < ROOM_M[:2] / 2).all()
     assert (volume[:, 2] < ROOM_M[2]).all()
 
@@ -204,7 +204,7 @@ def test_camera_keeps_its_distance_from_everything():
 
 
 def test_photograph_shows_what_the_pose_says(flights):
-    """Light, blur and noise do not move the image against its pose."""
+    """Light, blur and noise do not shift the image relative to its pose."""
     for frame in range(30, 2400, 500):
         clean = room().render(flights.poses[frame], flights.intrinsics, SIZE)
         grey = [
@@ -217,7 +217,7 @@ def test_photograph_shows_what_the_pose_says(flights):
 
 
 def test_flights_differ_in_light():
-    """Brightness and colour vary from flight to flight more than sensor noise does."""
+    """Brightness and colour vary more between flights than sensor noise does."""
     dataset = open_room("room,flights=8,frames=1,size=96x72")
     ratios = [
         dataset.read_image(i).mean(axis=(0, 1))
@@ -232,7 +232,7 @@ def test_flights_differ_in_light():
 
 
 def test_near_poses_look_alike_and_far_ones_do_not(flights):
-    """Image distance grows with pose distance: one image tells where it was taken."""
+    """Image distance grows with pose distance, so an image determines its pose."""
     frames = np.arange(0, 2400, 120)
     render = room().render
     images, neighbours = (

@@ -1,4 +1,4 @@
-"""TUM RGB-D: quaternions, association by stamp, cameras by name; the same poses as evo's."""
+"""TUM RGB-D: quaternions, association by stamp, cameras by name; evo reads the same poses."""
 
 import shutil
 from pathlib import Path
@@ -26,7 +26,7 @@ def write_images(folder, size=(48, 64)):
 
 
 def sequence(folder, images, poses, end="\n"):
-    """Write a sequence; stamps are thousandths after one second, a pose follows its stamp."""
+    """Write a sequence; stamps are milliseconds after a fixed second, each pose with its stamp."""
     folder.mkdir(parents=True)
     listed = [f"{SECOND}.{ms:03d}000 rgb/{SECOND}.{ms:03d}000.png" for ms in images]
     truth = [f"{SECOND}.{ms:03d}0 {pose}" for ms, pose in poses]
@@ -69,13 +69,13 @@ def test_an_image_gets_the_nearest_pose_within_twenty_milliseconds(tmp_path, end
     assert found.frame_names[0] == f"a/{SECOND}.080000"
     stamps = [int(name.split(".")[1]) // 1000 for name in found.frame_names]
     assert stamps == [80, 104, 105, 106, 130, 315, 500]
-    # The earlier of two equally near ones.
+    # Of two equally near poses, the earlier one is used.
     assert found.poses[:, 0].tolist() == [100, 100, 100, 110, 110, 300, 500]
     assert found.skipped == {"no pose within 0.02 s": 3}
 
 
 def test_stamps_are_compared_to_the_nanosecond(tmp_path):
-    # A double cannot tell these stamps apart.
+    # These stamps are equal in double precision.
     folder = sequence(tmp_path / "a", [100], [])
     truth = [f"{SECOND}.1200000{digit:02d} {digit} 0 0 0 0 0 1" for digit in (0, 1)]
     (folder / "groundtruth.txt").write_text("\n".join(truth))
@@ -126,7 +126,7 @@ def test_a_folder_of_sequences_is_one_data_set(tmp_path):
     room = tmp_path / "room"
     sequence(room / "walk_10", [100, 200], [(100, "1 0 0 0 0 0 1"), (200, "2 0 0 0 0 0 1")])
     sequence(room / "walk_2", [100], [(100, "3 0 0 0 0 0 1")])
-    sequence(room / "walk_3", [900], [(100, "3 0 0 0 0 0 1")])  # no frame: not named
+    sequence(room / "walk_3", [900], [(100, "3 0 0 0 0 0 1")])  # no posed frame
     (room / "notes").mkdir()
     found = open_dataset(f"tum:{room}")
     assert found.name == "room"
@@ -142,8 +142,8 @@ def test_sequences_of_two_cameras_are_refused(tmp_path):
     with pytest.raises(SourceError) as refusal:
         open_tum(str(tmp_path))
     assert str(refusal.value) == (
-        f"{tmp_path}: expected sequences of one camera, "
-        "found freiburg1_desk and freiburg2_desk of two"
+        f"{tmp_path}: expected sequences from one camera, "
+        "found different cameras in freiburg1_desk and freiburg2_desk"
     )
 
 
@@ -166,7 +166,7 @@ def test_sequences_of_two_cameras_are_refused(tmp_path):
         (
             "groundtruth.txt",
             b"\xff\xfe\xfa",
-            "a file of timestamp tx ty tz qx qy qz qw, found no UTF-8",
+            "a file of timestamp tx ty tz qx qy qz qw, found text that is not UTF-8",
         ),
         ("groundtruth.txt", None, "a file of timestamp tx ty tz qx qy qz qw, found none"),
     ],
@@ -186,5 +186,5 @@ def test_no_sequence_is_refused(tmp_path):
     with pytest.raises(SourceError) as refusal:
         open_tum(str(tmp_path))
     assert str(refusal.value) == (
-        f"{tmp_path}: expected rgb.txt, or folders that hold it, found neither"
+        f"{tmp_path}: expected rgb.txt, or folders that contain it, found neither"
     )

@@ -1,4 +1,4 @@
-"""Data sets by name: ``FORMAT:PATH``, one format a file."""
+"""Open data sets by name, ``FORMAT:PATH``; each format has its own module."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ FORMATS: dict[str, Callable[[str], PoseDataset]] = {
 def open_dataset(text: str) -> PoseDataset:
     """Open ``FORMAT:PATH``, e.g. ``7scenes:scenes/redkitchen`` or ``synthetic:room``.
 
-    What a path is and what the poses mean each format's module says.
+    The module of each format documents its paths and poses.
 
     Raises
     ------
     UsageError
-        The format is not known.
+        The format is unknown.
     SourceError
-        The data set cannot be read or holds no posed frame.
+        The data set cannot be read or has no frame with a pose.
     """
     name, colon, path = text.partition(":")
     if not colon or name not in FORMATS:

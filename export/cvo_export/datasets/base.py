@@ -1,4 +1,4 @@
-"""What every data set reader returns: images with a camera pose each, in sequences."""
+"""The common form of all data sets: sequences of images with a camera pose each."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Intrinsics(NamedTuple):
 
     @property
     def possible(self) -> bool:
-        """Whether there can be such a camera: finite numbers, positive focal lengths."""
+        """Whether all numbers are finite and the focal lengths positive."""
         return bool(np.isfinite(self).all()) and self.fx > 0.0 and self.fy > 0.0
 
     def scaled(self, factor: float) -> Intrinsics:
@@ -30,12 +30,12 @@ class Intrinsics(NamedTuple):
 
 @dataclass(frozen=True)
 class PoseDataset:
-    """Images with a known camera pose, grouped in sequences (one continuous recording each).
+    """Images with known camera poses, grouped in sequences (one continuous recording each).
 
     Attributes
     ----------
     name
-        Free name for reports and provenance; never a path.
+        Name for reports and provenance; never a path.
     poses
         Shape (n, 7), float64: tx ty tz in metres, then the unit quaternion qx qy qz qw of
         ``T_world_camera`` (OpenCV camera: x right, y down, z forward), frame by frame.
@@ -43,18 +43,18 @@ class PoseDataset:
         Shape (n,), integer: index into ``sequence_names``; frames of one sequence are contiguous
         and in time order.
     sequence_names
-        One name a sequence.
+        Name of each sequence.
     frame_names
-        One name a frame, unique in the data set, e.g. ``seq-01/frame-000007``.
+        Name of each frame, unique in the data set, e.g. ``seq-01/frame-000007``.
     read_image
-        Frame number -> image, shape (height, width, 3), uint8, BGR. Raises ``SourceError`` where
-        the image cannot be read.
+        Maps a frame number to an image, shape (height, width, 3), uint8, BGR. Raises
+        ``SourceError`` if the image cannot be read.
     intrinsics
-        The camera, or None where the data set does not say.
+        The camera, or None if the data set does not state it.
     own_train, own_test
-        Sequence indices of the data set's own train and test lists; both empty where it has none.
+        Sequence indices of the data set's own train and test lists; empty if it has no lists.
     skipped
-        Reason -> number of frames left out by the reader.
+        Number of frames that the reader left out, by reason.
     """
 
     name: str
@@ -73,7 +73,7 @@ class PoseDataset:
 
 
 def skipped_text(skipped: Mapping[str, int]) -> str:
-    """Return how many frames a reader left out and why, e.g. ``skipped 3: invalid pose 3``."""
+    """Return a text with the number of skipped frames by reason: ``skipped 3: invalid pose 3``."""
     if not skipped:
         return "none skipped"
     reasons = ", ".join(f"{reason} {count}" for reason, count in skipped.items())

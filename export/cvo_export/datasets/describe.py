@@ -1,4 +1,4 @@
-"""A data set as text for a person: what was read, and what was left out and why."""
+"""Describe a data set as text: what was read, and which frames were skipped and why."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from cvo_export.datasets.base import PoseDataset, skipped_text
 
 
 def summary(dataset: PoseDataset) -> str:
-    """One line: name, frames, sequences and skipped frames."""
+    """Return one line with name, frames, sequences and skipped frames."""
     frames = _counted(len(dataset), "frame")
     sequences = _counted(len(dataset.sequence_names), "sequence")
     return f"{dataset.name:<11} {frames} in {sequences}; {skipped_text(dataset.skipped)}"
 
 
 def describe(dataset: PoseDataset) -> list[str]:
-    """The summary, then image, camera, extent of the positions and frames of each sequence.
+    """Return the summary, image size, camera, extent of the positions and frames per sequence.
 
-    Raises SourceError where the first image cannot be read.
+    Raises SourceError if the first image cannot be read.
     """
     height, width = dataset.read_image(0).shape[:2]
     camera = "not stated"

@@ -1,13 +1,13 @@
-"""EuRoC MAV (Burri et al. 2016), the ASL layout: ``mav0/cam0`` and the ground truth beside it.
+"""EuRoC MAV (Burri et al. 2016) in the ASL layout: images and ground truth under ``mav0``.
 
-``cam0/data.csv`` lists ``timestamp,filename`` of the images in ``cam0/data``, and
-``state_groundtruth_estimate0/data.csv`` states ``timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z,...``:
-integer nanoseconds, metres and a quaternion, scalar first. That is the pose of the body (the IMU)
-in the world. ``T_BS`` of ``cam0/sensor.yaml`` is ``T_body_camera``, so that
+``cam0/data.csv`` lists ``timestamp,filename`` of the images in ``cam0/data``.
+``state_groundtruth_estimate0/data.csv`` lists ``timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z,...``:
+integer nanoseconds, metres and a quaternion, scalar first. This is the pose of the body (the IMU)
+in the world. ``T_BS`` in ``cam0/sensor.yaml`` is ``T_body_camera``, so
 
     T_world_camera = T_world_body @ T_BS
 
-Images are grey and given as BGR. Their lens distortion is not corrected.
+Images are grey and returned as BGR. Lens distortion is not corrected.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ _CAMERA = "mav0/cam0/sensor.yaml"
 _POSES = "mav0/state_groundtruth_estimate0/data.csv"
 
 # One period of the ground truth (200 Hz). Camera and IMU are triggered together and the ground
-# truth has the IMU's stamps, so that the nearest one is the image's own: nothing to interpolate.
+# truth uses the IMU's stamps, so the nearest pose belongs to the image and needs no interpolation.
 _MAX_STAMP_DIFFERENCE_NS = 5_000_000
 
 
 def open_euroc(path: str) -> PoseDataset:
-    """Read a recording, the folder that holds ``mav0``, or the recordings in a folder.
+    """Read one recording (the folder that contains ``mav0``), or all recordings in a folder.
 
-    Several recordings make sense where they share the world frame, as those of one room do
-    (``V1_01`` to ``V1_03``, ``V2_01`` to ``V2_03``); no file says so. Each image gets the pose of
-    the nearest stamp. Frames without one within 5 ms, with an invalid one or without their image
-    are left out and counted. Intrinsics are given where ``sensor.yaml`` states a pinhole with
-    radial-tangential distortion.
+    Only combine recordings that share a world frame, as those from one room do (``V1_01`` to
+    ``V1_03``, ``V2_01`` to ``V2_03``); the files do not say, so this is not checked. Each image
+    gets the pose with the nearest stamp. Frames with no pose within 5 ms, an invalid pose or a
+    missing image are left out and counted. Intrinsics are set if ``sensor.yaml`` describes a
+    pinhole camera with radial-tangential distortion.
 
-    Raises SourceError where a file is missing or malformed, recordings are of two cameras, or there
-    is no posed frame.
+    Raises SourceError if a file is missing or malformed, recordings come from different cameras,
+    or no frame has a pose.
     """
     root = Path(path)
     frames = FrameList(root)
@@ -81,27 +81,30 @@ def _add_recording(frames: FrameList, name: str, folder: Path, T_body_camera: Ar
 def _read_camera(path: Path) -> tuple[Intrinsics | None, Array]:
     """Return the intrinsics and ``T_body_camera``, shape (4, 4), metres."""
     text = read_text(path, "a camera's T_BS and intrinsics")
-    # OpenCV's tools want a first line %YAML:1.0, which is no YAML.
+    # OpenCV's tools require a first line %YAML:1.0, which is not valid YAML.
     text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
     try:
         document: Any = yaml.safe_load(text)
-    # A date that is none and brackets without end are errors of other kinds.
+    # An impossible date raises ValueError, and endless brackets raise RecursionError.
     except (yaml.YAMLError, ValueError, RecursionError):
         document = None
     if not isinstance(document, dict):
-        raise SourceError(f"{path}: expected YAML with T_BS and intrinsics, found none")
+        raise SourceError(f"{path}: expected YAML with T_BS and intrinsics, found other text")
     T_BS = document.get("T_BS")
     matrix = _numbers(T_BS.get("data") if isinstance(T_BS, dict) else T_BS, 16)
     if matrix is None or matrix_to_pose(matrix.reshape(4, 4)) is None:
         found = " ".join(str(T_BS).split())[:80]
-        raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid motion, found {found}")
+        raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid transform, found {found}")
     intrinsics = _numbers(document.get("intrinsics"), 4)
     model = document.get("camera_model"), document.get("distortion_model")
     if intrinsics is None or model != ("pinhole", "radial-tangential"):
         return None, matrix.reshape(4, 4)
     camera = Intrinsics(*intrinsics.tolist())
     if not camera.possible:
-        raise SourceError(f"{path}: expected intrinsics of a camera, found {intrinsics.tolist()}")
+        raise SourceError(
+            f"{path}: expected finite intrinsics with positive focal lengths, found "
+            f"{intrinsics.tolist()}"
+        )
     return camera, matrix.reshape(4, 4)
 
 

@@ -1,4 +1,4 @@
-"""Which folders under a path are recordings."""
+"""Find the recordings under a path."""
 
 from __future__ import annotations
 
@@ -11,42 +11,43 @@ from cvo_export.datasets.base import Intrinsics
 
 
 def recordings(root: Path, marker: str) -> dict[str, Path]:
-    """``root`` where it holds the file ``marker``, else its folders that do, in natural order.
+    """Return ``root`` if it contains ``marker``, otherwise all its folders that do, by name.
 
-    By name. They become sequences of one data set: it is for data whose recordings share a world
-    frame. Raises SourceError where there is none.
+    Folders are in natural order and become sequences of one data set, so their recordings must
+    share a world frame. Raises SourceError if there is no such folder.
     """
     if (root / marker).is_file():
         return {root.resolve().name: root}
     folders = [file.parents[marker.count("/")] for file in root.glob(f"*/{marker}")]
     found = {folder.name: folder for folder in sorted(folders, key=natural_key)}
     if not found:
-        raise SourceError(f"{root}: expected {marker}, or folders that hold it, found neither")
+        raise SourceError(f"{root}: expected {marker}, or folders that contain it, found neither")
     return found
 
 
 def only_world(root: Path, folders: list[Path], kind: str) -> Path:
-    """Return the one folder of data whose folders have a world frame each.
+    """Return the only folder, for data in which each folder has its own world frame.
 
-    Raises SourceError where there are several, naming them, or none.
+    Raises SourceError if there is no folder, or more than one; the message names them.
     """
     if not folders:
         raise SourceError(f"{root}: expected a {kind}, found none")
     if len(folders) > 1:
         names = ", ".join(folder.name for folder in folders)
         raise SourceError(
-            f"{root}: expected one {kind}, as each has a world frame of its own, found {names}; "
+            f"{root}: expected one {kind}, because each has its own world frame, found {names}; "
             f"choose one, e.g. {folders[0]}"
         )
     return folders[0]
 
 
 def only_camera(root: Path, cameras: Mapping[str, Intrinsics | None]) -> Intrinsics | None:
-    """Return the camera of all sequences, by name; raises SourceError where they have several."""
+    """Return the camera of all sequences; raises SourceError if they have different cameras."""
     (first, camera), *others = cameras.items()
     for name, other in others:
         if other != camera:
             raise SourceError(
-                f"{root}: expected sequences of one camera, found {first} and {name} of two"
+                f"{root}: expected sequences from one camera, found different cameras in {first} "
+                f"and {name}"
             )
     return camera

@@ -1,4 +1,4 @@
-"""Frames as a reader finds them: those with an image and a pose are kept, the others counted."""
+"""Collect frames for a data set: keep those with an image and a pose, count the others."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ Array = NDArray[np.float64]
 
 
 class FrameList:
-    """What a reader gathers, sequence by sequence and in time order within each."""
+    """The frames that a reader collects, sequence by sequence and in time order."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
         self._images: list[Path] = []
         self._poses: list[Array] = []
         self._sequence: list[int] = []
-        # Dictionaries for their order: the number of a sequence is its place.
+        # Dictionaries keep insertion order, which numbers the sequences.
         self._sequence_names: dict[str, int] = {}
         self._frame_names: dict[str, None] = {}
         self._skipped: Counter[str] = Counter()
 
     def add(self, sequence: str, name: str, image: Path, pose: Array | None) -> None:
-        """Keep a frame with its ``T_world_camera`` (7,), or count why it is left out.
+        """Add a frame with its ``T_world_camera`` (7,), or count it as skipped.
 
-        None stands for an invalid pose; a sequence without a frame does not appear.
+        A pose of None is invalid. A sequence appears only if at least one of its frames is kept.
         """
         frame = f"{sequence}/{name}"
         if pose is None:
@@ -51,7 +51,7 @@ class FrameList:
     def add_numbered(
         self, sequence: str, images: Mapping[int, Path], poses: Sequence[Array | None]
     ) -> None:
-        """Frame i has the pose i, counted from 0; what has no counterpart is left out."""
+        """Add images with the poses of the same number, from 0; skip those without a partner."""
         for number in sorted(images.keys() | range(len(poses))):
             if number not in images:
                 self.skip("image missing")
@@ -62,11 +62,11 @@ class FrameList:
                 self.add(sequence, image.stem.removesuffix("-color"), image, poses[number])
 
     def skip(self, reason: str) -> None:
-        """Count a frame that is left out."""
+        """Count a skipped frame."""
         self._skipped[reason] += 1
 
     def dataset(self, name: str) -> PoseDataset:
-        """Return what was kept; raises SourceError where that is nothing."""
+        """Return the data set of the kept frames; raises SourceError if there are none."""
         if not self._images:
             skipped = f"; {skipped_text(self._skipped)}" if self._skipped else ""
             raise SourceError(f"{self._root}: expected frames with a pose, found none{skipped}")
@@ -82,7 +82,7 @@ class FrameList:
 
 
 def image_reader(paths: Sequence[Path]) -> Callable[[int], NDArray[np.uint8]]:
-    """Return the ``read_image`` of a data set of image files, colour or grey, all as BGR."""
+    """Return a ``read_image`` for image files; colour and grey images are read as BGR."""
 
     def read_image(index: int) -> NDArray[np.uint8]:
         path = paths[index]
@@ -90,10 +90,10 @@ def image_reader(paths: Sequence[Path]) -> Callable[[int], NDArray[np.uint8]]:
             image = decode_image(path.read_bytes())
         except OSError as error:
             raise SourceError(
-                f"{path}: expected an image, found that it cannot be read: {error.strerror}"
+                f"{path}: expected an image; the file cannot be read: {error.strerror}"
             ) from None
         if image is None:
-            raise SourceError(f"{path}: expected a whole image, found a damaged one")
+            raise SourceError(f"{path}: expected an image, found a damaged or incomplete file")
         return image
 
     return read_image

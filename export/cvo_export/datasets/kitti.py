@@ -1,9 +1,10 @@
 """KITTI odometry (Geiger et al. 2012): ``sequences/NN/image_2`` or ``image_0``, ``poses/NN.txt``.
 
 Line i of a pose file, counted from 0, belongs to image i: twelve numbers, the rows of the 3x4
-matrix ``T_world_camera0`` in metres. Camera 0 is the left grey one (OpenCV), the world frame its
-first frame. ``calib.txt`` gives for each camera P = K [I | b], which projects from the rectified
-frame of camera 0: a camera sees ``p_camera = p_camera0 + b`` in its own frame, in metres.
+matrix ``T_world_camera0`` in metres. Camera 0 is the left grey camera (OpenCV convention), and the
+world frame is its frame at the first image. For each camera, ``calib.txt`` gives the projection
+P = K [I | b] from the rectified frame of camera 0: a point has the coordinates
+``p_camera = p_camera0 + b``, in metres, in the camera's own frame.
 """
 
 from __future__ import annotations
@@ -30,14 +31,15 @@ _SUFFIXES = (".png", ".jpg")
 
 
 def open_kitti(path: str) -> PoseDataset:
-    """Read one sequence: ``ROOT/sequences/NN``, with its poses in ``ROOT/poses/NN.txt``.
+    """Read one sequence, ``ROOT/sequences/NN``, with its poses in ``ROOT/poses/NN.txt``.
 
-    Each sequence is a world of its own; ``ROOT`` will do where a single one has poses. Images are
-    those of the left colour camera, ``image_2``, or else of the left grey one, ``image_0``, and
-    poses and intrinsics that camera's. Frames without an image or a pose, or with one that is no
-    pose, are left out and counted. The data set is named ``kitti-NN``. ``times.txt`` is not read.
+    Each sequence has its own world frame; ``path`` may be ``ROOT`` if only one sequence has poses.
+    Images, poses and intrinsics are those of the left colour camera (``image_2``) or, if it is
+    missing, of the left grey camera (``image_0``). Frames with a missing image, a missing pose or
+    an invalid pose are left out and counted. The data set is named ``kitti-NN``. ``times.txt`` is
+    not read.
 
-    Raises SourceError where there are several sequences, no posed frame, or a malformed file.
+    Raises SourceError if there are several sequences, a file is malformed, or no frame has a pose.
     """
     root = Path(path).absolute()
     folder = root

@@ -1,9 +1,10 @@
 """RGB-D Scenes v2 (Lai et al. 2014): ``imgs/scene_NN/NNNNN-color.png`` with ``pc/NN.pose``.
 
 Line i of a pose file, counted from 0, belongs to image i and holds ``a b c d x y z``: the
-quaternion a + bi + cj + dk, scalar first, then the camera's position in metres; together
-``T_world_camera`` of an OpenCV camera. The world frame is that of the scene's first camera, so that
-poses of two scenes are not comparable: a data set is one scene. Depth images are not read.
+quaternion a + bi + cj + dk, scalar first, then the camera's position in metres. Together they are
+``T_world_camera`` of an OpenCV camera. The world frame is the first camera frame of the scene, so
+poses of different scenes are not comparable, and a data set is one scene. Depth images are not
+read.
 """
 
 from __future__ import annotations
@@ -22,18 +23,19 @@ from cvo_export.datasets.tables import read_rows
 
 _COLOUR = "-color.png"
 
-# What the data set's authors make points of depth images with, for 640x480.
+# The authors use these intrinsics to convert depth images to points, at 640x480.
 _NOMINAL, _NOMINAL_WIDTH = Intrinsics(570.3, 570.3, 320.0, 240.0), 640
 
 
 def open_rgbd_scenes(path: str) -> PoseDataset:
-    """Read one scene: ``ROOT/imgs/scene_NN``, with its poses in ``ROOT/pc/NN.pose``.
+    """Read one scene, ``ROOT/imgs/scene_NN``, with its poses in ``ROOT/pc/NN.pose``.
 
-    ``ROOT`` will do where it holds a single scene. Frames without an image or a pose, or with one
-    that is no pose, are left out and counted. Intrinsics are the authors' nominal ones, scaled to
-    the images' width.
+    ``path`` may be ``ROOT`` if it contains a single scene. Frames with a missing image, a missing
+    pose or an invalid pose are left out and counted. The intrinsics are the authors' nominal ones,
+    scaled to the images' width.
 
-    Raises SourceError where there are several scenes, no posed frame, or a line that is no pose's.
+    Raises SourceError if there are several scenes, a line of the pose file is malformed, or no
+    frame has a pose.
     """
     root = Path(path).absolute()
     folder = root

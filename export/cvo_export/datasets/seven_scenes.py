@@ -1,7 +1,8 @@
-"""7-Scenes (Shotton et al. 2013): ``seq-NN/frame-NNNNNN.color.png|jpg`` beside ``.pose.txt``.
+"""7-Scenes (Shotton et al. 2013): ``seq-NN/frame-NNNNNN.color.png|jpg`` with ``.pose.txt``.
 
-A pose file holds the 4x4 camera-to-world matrix in metres, OpenCV camera. ``TrainSplit.txt`` and
-``TestSplit.txt`` list ``sequenceN``. A folder with the frames of a single sequence is read as well.
+A pose file contains the 4x4 camera-to-world matrix in metres, for an OpenCV camera.
+``TrainSplit.txt`` and ``TestSplit.txt`` list ``sequenceN``. A folder with the frames of a single
+sequence can be read too.
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ from cvo_export.datasets.frames import FrameList
 
 _COLOUR = (".color.png", ".color.jpg")
 
-# The Kinect's nominal focal length, given by the data set's authors for 640x480.
+# The Kinect's nominal focal length at 640x480, as stated by the data set's authors.
 _NOMINAL_FOCAL_PX, _NOMINAL_WIDTH = 585.0, 640
 
 
 def open_seven_scenes(path: str) -> PoseDataset:
-    """Read a scene folder with ``seq-NN`` folders, or one such folder.
+    """Read a scene folder with ``seq-NN`` folders, or a single ``seq-NN`` folder.
 
-    Frames without a pose file, or with one that is no pose (lost tracking), are left out and
-    counted. Intrinsics come from ``camera-intrinsics.txt`` (a 3x3 matrix) where there is one, else
-    the data set's nominal focal length scaled to the images' width.
+    Frames with a missing pose file or an invalid pose (lost tracking) are left out and counted.
+    Intrinsics come from ``camera-intrinsics.txt`` (a 3x3 matrix) if it exists, otherwise from the
+    data set's nominal focal length, scaled to the images' width.
 
-    Raises SourceError where there is no posed frame.
+    Raises SourceError if no frame has a pose.
     """
     root = Path(path)
     if not root.is_dir():
-        raise SourceError(f"{root}: expected a 7-Scenes folder, found none")
+        raise SourceError(f"{root}: expected a 7-Scenes folder, found no folder")
     folders = sorted(root.glob("seq-*"), key=natural_key)
     folders = [folder for folder in folders if folder.is_dir()] or [root]
     frames = FrameList(root)
@@ -59,9 +60,9 @@ def open_seven_scenes(path: str) -> PoseDataset:
 
 
 def write_sequence(dataset: PoseDataset, sequence: int, folder: Path, frames: int | None) -> int:
-    """Write the first ``frames`` of a sequence in this layout, JPEG quality 92; returns how many.
+    """Write the first ``frames`` frames of a sequence in this layout and return their number.
 
-    Raises SinkError where the folder exists or cannot be written.
+    Images are JPEG files of quality 92. Raises SinkError if the folder exists or cannot be written.
     """
     indices = np.flatnonzero(dataset.sequence == sequence)[:frames]
     try:
@@ -75,7 +76,7 @@ def write_sequence(dataset: PoseDataset, sequence: int, folder: Path, frames: in
             rows = "\n".join("\t".join(f"{value:.9e}" for value in row) for row in matrix)
             (folder / (stem + MATRIX_SUFFIX)).write_text(rows + "\n", "ascii")
     except FileExistsError:
-        raise SinkError(f"{folder}: expected a new folder, found one that exists") from None
+        raise SinkError(f"{folder}: expected a new folder, found an existing one") from None
     except OSError as error:
         raise SinkError(f"{folder}: cannot be written: {error.strerror}") from None
     return int(indices.size)
@@ -87,7 +88,7 @@ def _colour_images(folder: Path) -> list[Path]:
 
 
 def _own_list(path: Path, names: tuple[str, ...]) -> frozenset[int]:
-    """Indices of the sequences a split file lists; those that are not on disk are left out."""
+    """Return the indices of the sequences on disk that a split file lists."""
     if not path.is_file():
         return frozenset()
     numbers = {int(number) for number in re.findall(r"\d+", path.read_text("utf-8-sig", "replace"))}
@@ -107,8 +108,10 @@ def _intrinsics(root: Path, shape: tuple[int, ...]) -> Intrinsics:
     try:
         K = np.array(path.read_text("ascii").split(), dtype=np.float64).reshape(3, 3)
     except ValueError:
-        raise SourceError(f"{path}: expected nine numbers of a 3x3 matrix") from None
+        raise SourceError(f"{path}: expected the nine numbers of a 3x3 matrix") from None
     found = Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     if not found.possible:
-        raise SourceError(f"{path}: expected intrinsics of a camera, found {K.tolist()}")
+        raise SourceError(
+            f"{path}: expected finite intrinsics with positive focal lengths, found {K.tolist()}"
+        )
     return found

@@ -1,4 +1,4 @@
-"""Images and poses with a clock each: every image gets the pose of the nearest stamp."""
+"""Associate images and poses by time stamp: each image gets the pose with the nearest stamp."""
 
 from __future__ import annotations
 
@@ -22,21 +22,23 @@ def add_associated(
     pose_of: Callable[[int], Array | None],
     bound_ns: int,
 ) -> None:
-    """Add a sequence in the order of its images' stamps.
+    """Add a sequence to ``frames``, in the order of its images' stamps.
 
     Parameters
     ----------
     frames
-        Where the frames are added.
+        The list to add to.
     sequence
-        Its name.
+        Name of the sequence.
     images
-        Stamp, in nanoseconds, and file of each image.
-    stamps_ns, pose_of
-        Stamps of the poses, in any order, and the pose (7,) of a place in them, None where it is
-        invalid.
+        Stamp in nanoseconds and file of each image.
+    stamps_ns
+        Stamps of the poses, in any order.
+    pose_of
+        Maps an index in ``stamps_ns`` to the pose (7,), or None if it is invalid.
     bound_ns
-        An image whose nearest pose is further away is left out and counted.
+        Largest distance between the stamps of an image and its pose; images without a pose within
+        it are left out and counted.
     """
     order = sorted(range(len(stamps_ns)), key=stamps_ns.__getitem__)
     ascending = [stamps_ns[place] for place in order]

@@ -1,8 +1,8 @@
-"""The synthetic room as a data set: flights with exact poses, for the demonstration and tests.
+"""The synthetic room as a data set: flights with exact poses, for demonstration and tests.
 
-The scene is the same for every seed (``cvo_export.scene.room``, which also states the world frame);
-the seed draws the flights, their light and their noise. The principal point is the middle of the
-image, ((width - 1) / 2, (height - 1) / 2); motion blur is centred on the pose of its frame.
+The scene is the same for every seed; ``cvo_export.scene.room`` describes it and its world frame.
+The seed determines the flights, their light and their noise. The principal point is the image
+centre, ((width - 1) / 2, (height - 1) / 2). Motion blur is centred on the pose of its frame.
 """
 
 from __future__ import annotations
@@ -33,25 +33,26 @@ class _Options(NamedTuple):
 
 
 def open_room(spec: str = "room") -> PoseDataset:
-    """Open the synthetic room; images are rendered when they are read.
+    """Open the synthetic room; ``read_image`` renders the images.
 
     Parameters
     ----------
     spec
-        ``room``, then any of ``,flights=48`` (1..1000), ``,frames=50`` (a flight, 1..10000),
-        ``,size=320x240`` (64x48..1920x1080) and ``,seed=0`` (0..4294967295). Flight i and its frame
-        j depend on the seed, i and j alone: asking for more leaves the earlier ones as they were.
+        ``room``, then any of ``,flights=48`` (1..1000), ``,frames=50`` (per flight, 1..10000),
+        ``,size=320x240`` (64x48..1920x1080) and ``,seed=0`` (0..4294967295). Frame j of flight i
+        depends only on the size, the seed, i and j, so more flights or frames do not change the
+        earlier ones.
 
     Returns
     -------
     PoseDataset
-        Named ``synthetic-room``, with one sequence a flight. ``read_image`` may be called from
+        Named ``synthetic-room``, with one sequence per flight. ``read_image`` may be called from
         several threads, in any order, and raises ``IndexError`` past the last frame.
 
     Raises
     ------
     UsageError
-        The specification has another name, an unknown or repeated option, or a value out of range.
+        The specification does not name ``room``, or an option is unknown, repeated or out of range.
     """
     options = _parse(spec)
     fx = _FOCAL_PER_WIDTH * options.width
@@ -93,7 +94,7 @@ def _parse(spec: str) -> _Options:
             )
         for field, digits in found.items():
             if field in values:
-                raise UsageError(f"expected {key} once, found it again in {spec!r}")
+                raise UsageError(f"expected {key} once, found it twice in {spec!r}")
             low, high = _RANGES[field]
             if not (digits.isascii() and digits.isdigit() and low <= int(digits) <= high):
                 raise UsageError(f"expected {_EXPECTED[key]}, found {item!r} in {spec!r}")
@@ -121,12 +122,12 @@ _FRAME_TIME_S = 1 / 30
 _EXPOSURE_S = 1 / 200
 
 # Every degree of freedom is a sum of three sinusoids whose amplitudes add up to its reach: it is
-# smooth, cannot leave centre +- reach, and has a standard deviation of 0.44 times the reach. The
-# volume is small enough for a small network to learn, the pace that of a hand-held camera.
+# smooth, stays within centre +- reach, and has a standard deviation of 0.44 times the reach. The
+# volume is small enough for a small network to learn; the speed is that of a hand-held camera.
 _CENTRE = np.array([0.0, -0.4, 1.3, 0.0, 0.0, 0.0])  # x y z in metres; yaw pitch roll in radians
 _REACH = np.array([0.4, 0.3, 0.15, *np.radians([17.5, 7.5, 4.0])])
 _TURNS = {3: np.array([0, 0, 1]), 4: np.array([1, 0, 0]), 5: np.array([0, 0, 1])}
-_LEVEL = quaternion_exp([-math.pi / 2, 0, 0])  # looks along world y, its image's top towards z
+_LEVEL = quaternion_exp([-math.pi / 2, 0, 0])  # looks along world y, with z up in the image
 _SHARES = np.array([0.5, 0.35, 0.15])
 _RATES_RAD_S = np.array([1.28, 2.72, 4.8])
 
@@ -145,18 +146,18 @@ class _Flight:
         return np.random.default_rng((*self._entropy, stream))
 
     def poses(self, times_s: Floats) -> Floats:
-        """Return ``T_world_camera`` at some times, shape (n, 7): tx ty tz, qx qy qz qw."""
+        """Return ``T_world_camera`` at n times, shape (n, 7): tx ty tz, qx qy qz qw."""
         angles = self._rate * times_s[:, None, None] + self._phase
         state = _CENTRE + _REACH * (np.sin(angles) @ _SHARES)
         yaw, pitch, roll = (quaternion_exp(state[:, [k]] * axis) for k, axis in _TURNS.items())
-        # From the right: roll about the optical axis, pitch about the camera's x axis (positive
-        # looks up), the level camera that looks along world y, yaw about world z.
+        # Right to left: roll about the optical axis, pitch about the camera's x axis (positive
+        # looks up), the level camera looking along world y, yaw about world z.
         tilt = quaternion_multiply(pitch, roll)
         rotation = quaternion_multiply(yaw, quaternion_multiply(_LEVEL, tilt))
         return np.concatenate([state[:, :3], rotation], axis=1)
 
     def photograph(self, frame: int, intrinsics: Intrinsics, size: tuple[int, int]) -> Image:
-        """Render a frame as this flight's camera sees it, shape (height, width, 3), BGR."""
+        """Render a frame with this flight's blur, light and noise, (height, width, 3), BGR."""
         time_s = frame * _FRAME_TIME_S
         opening, pose, closing = self.poses(time_s + _EXPOSURE_S * np.array([-0.5, 0.0, 0.5]))
         sharp = room().render(pose, intrinsics, size)

@@ -1,4 +1,4 @@
-"""Text files with one record a line: columns, numbers, and which line a refusal is about."""
+"""Read text files with one record per line; errors name the line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SHOWN = 80
 
 
 class Row(NamedTuple):
-    """One line of a file; ``form`` names the columns that it should have."""
+    """One line of a file; ``form`` names the expected columns."""
 
     path: Path
     number: int
@@ -25,7 +25,7 @@ class Row(NamedTuple):
     form: str
 
     def numbers(self, start: int = 0) -> Array:
-        """Return the columns from ``start`` on, shape (n,); nan and inf are numbers, too."""
+        """Return the columns from ``start`` on, shape (n,); nan and inf are accepted."""
         try:
             return np.array(self.fields[start:], dtype=np.float64)
         except ValueError:
@@ -40,13 +40,13 @@ class Row(NamedTuple):
 
     def nanoseconds(self) -> int:
         """Return the first column, a time in integer nanoseconds."""
-        # 64 bits of them end in the year 2262.
+        # 19 digits are the most that fit into 64 bits.
         if not (self.fields[0].isdecimal() and len(self.fields[0]) <= 19):
             raise self.refusal()
         return int(self.fields[0])
 
     def refusal(self) -> SourceError:
-        """Return the error that says what was expected in this line."""
+        """Return an error that states what was expected in this line."""
         found = " ".join(self.fields)[:_SHOWN]
         return SourceError(
             f"{self.path}: expected {self.form}, found {found!r} in line {self.number}"
@@ -61,26 +61,26 @@ def read_rows(
     comments: bool = True,
     more: bool = False,
 ) -> list[Row]:
-    """Read a file whose lines have the columns that ``form`` names, separated by blanks.
+    """Read a file whose lines have the columns that ``form`` names.
 
     Parameters
     ----------
     path
-        UTF-8 text; lines may end as on any system.
+        UTF-8 text with any line endings.
     form
-        The columns' names, separated as the columns are.
+        Names of the columns, separated in the same way as the columns.
     separator
-        What separates columns instead of blanks.
+        Column separator; None separates by white space.
     comments
-        Whether blank lines and lines that begin with ``#`` are passed over. Where lines count as
-        frames they are refused: only the end of the file may be blank.
+        Whether to skip blank lines and lines that begin with ``#``. If not, they are errors,
+        except for blank lines at the end of the file; use this where line numbers are frames.
     more
-        Whether lines may have more columns; those are left out.
+        Whether lines may have more columns, which are ignored.
 
     Raises
     ------
     SourceError
-        The file cannot be read, or a line has other columns.
+        The file cannot be read, or a line has the wrong number of columns.
     """
     width = len(form.split(separator))
     rows: list[Row] = []
@@ -96,13 +96,13 @@ def read_rows(
 
 
 def read_text(path: Path, form: str) -> str:
-    """Read a UTF-8 file; raises SourceError, saying that ``form`` was expected."""
+    """Read a UTF-8 file; raises SourceError, stating that ``form`` was expected."""
     try:
         return path.read_text("utf-8-sig")
     except FileNotFoundError:
-        found = "none"
+        problem = "found none"
     except OSError as error:
-        found = f"that it cannot be read: {error.strerror}"
+        problem = f"but it cannot be read: {error.strerror}"
     except UnicodeDecodeError:
-        found = "no UTF-8"
-    raise SourceError(f"{path}: expected a file of {form}, found {found}")
+        problem = "found text that is not UTF-8"
+    raise SourceError(f"{path}: expected a file of {form}, {problem}")

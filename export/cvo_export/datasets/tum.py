@@ -1,9 +1,9 @@
-"""TUM RGB-D (Sturm et al. 2012): ``rgb.txt`` lists images, ``groundtruth.txt`` poses, by stamp.
+"""TUM RGB-D (Sturm et al. 2012): images in ``rgb.txt`` and poses in ``groundtruth.txt``, by stamp.
 
 A line of ``groundtruth.txt`` is ``timestamp tx ty tz qx qy qz qw``: seconds, metres and a
-quaternion, scalar last; together ``T_world_camera`` of the colour camera (OpenCV), in the frame of
-the motion capture system. Lines that begin with ``#`` are comments. Depth images are not read, and
-the lens distortion of freiburg1 and freiburg2 is not corrected.
+quaternion, scalar last. The pose is ``T_world_camera`` of the colour camera (OpenCV), in the frame
+of the motion capture system. Lines that begin with ``#`` are comments. Depth images are not read,
+and the lens distortion of freiburg1 and freiburg2 is not corrected.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from cvo_export.datasets.poses import quaternion_pose
 from cvo_export.datasets.stamps import add_associated
 from cvo_export.datasets.tables import read_rows
 
-# The colour cameras as the data set's authors calibrated them ("File formats", table of intrinsics
-# of the RGB cameras), for 640x480. The images of freiburg3 are undistorted already.
+# Intrinsics of the colour cameras at 640x480, as calibrated by the data set's authors ("File
+# formats", table of intrinsics of the RGB cameras). The images of freiburg3 are undistorted.
 _CAMERAS = {
     "1": Intrinsics(517.3, 516.5, 318.6, 255.3),
     "2": Intrinsics(520.9, 521.0, 325.1, 249.7),
@@ -31,16 +31,16 @@ _NOMINAL_WIDTH = 640
 
 
 def open_tum(path: str) -> PoseDataset:
-    """Read a sequence folder, or the sequence folders in a folder.
+    """Read one sequence folder, or all sequence folders in a folder.
 
-    Several sequences make sense where they share the world frame, as recordings in one room with
-    one set-up of the motion capture system do; no file says so. Each image gets the pose of the
-    nearest stamp. Frames without one within 0.02 s, with an invalid one or without their image are
-    left out and counted. Intrinsics are known where the folder's name says freiburg1, 2 or 3 (or
-    fr1, 2 or 3), and scaled to the images' width.
+    Only combine sequences that share a world frame: recordings in one room with one set-up of the
+    motion capture system. The files do not say, so this is not checked. Each image gets the pose
+    with the nearest stamp. Frames with no pose within 0.02 s, an invalid pose or a missing image
+    are left out and counted. Intrinsics are set if the folder's name contains freiburg1, 2 or 3
+    (or fr1, 2 or 3); they are scaled to the images' width.
 
-    Raises SourceError where a list is missing or malformed, sequences are of two cameras, or there
-    is no posed frame.
+    Raises SourceError if a list is missing or malformed, sequences come from different cameras, or
+    no frame has a pose.
     """
     root = Path(path)
     folders = recordings(root, "rgb.txt")
