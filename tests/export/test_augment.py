@@ -1,4 +1,4 @@
-"""A camera that only turns: the homography and the label belong together."""
+"""Augmentation by camera rotation: the homography matches the label."""
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from cvo_export.scene.room import room
 SIZE = (320, 240)
 K = Intrinsics(292.5, 292.5, 159.5, 119.5)
 MATRIX = np.array([[292.5, 0, 159.5], [0, 292.5, 119.5], [0, 0, 1]])
-# Looking along +y of the world (z up): camera x right, y down, z forward.
+# A camera (x right, y down, z forward) that looks along +y of the world (z up).
 LOOKING = geometry.matrix_to_quaternion(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
 
 
@@ -76,7 +76,7 @@ def test_light_changes_more_with_strength():
 
 
 def test_intrinsics_follow_resize_and_crop():
-    """The same ray goes through the same place of the camera's image and of the model's input."""
+    """A ray passes through corresponding places of the camera image and the model input."""
     for shape, height, width, crop in (
         ((480, 640), 192, 256, "none"),
         ((480, 800), 192, 256, "centre"),
@@ -88,6 +88,6 @@ def test_intrinsics_follow_resize_and_crop():
         cropped = shape[1] - 2 * left
         ray = np.array([0.1, -0.05, 1.0])
         pixel = np.array([camera.fx * 0.1 + camera.cx, camera.fy * -0.05 + camera.cy])
-        # Continuous coordinates, where a pixel's centre is at one half, scale exactly.
+        # Coordinates in which pixel centres are at one half scale exactly.
         scaled = (pixel + 0.5 - [left, 0]) * [width / cropped, height / shape[0]] - 0.5
         np.testing.assert_allclose((found @ ray)[:2], scaled, atol=1e-9)

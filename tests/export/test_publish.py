@@ -1,4 +1,4 @@
-"""From run to bundle: parity, thresholds through the runtime, all or nothing."""
+"""From run to bundle: parity, thresholds through the runtime, atomic writing."""
 
 import copy
 import dataclasses
@@ -135,7 +135,7 @@ def test_members_learn_beside_each_other_as_if_alone():
     second.load_state_dict(first.state_dict())
     learner.loss(features, y, warm_up=True).backward()
     slopes = [member.encoder[0].weight.grad for member in (first, second)]
-    # The same weights and rows, but each has noise of its own.
+    # Weights and rows are the same, but each member draws its own noise.
     assert all(slope.abs().sum() > 0 for slope in slopes)
     assert not torch.allclose(*slopes)
     prediction = learner.network.samples(features)
@@ -183,6 +183,6 @@ def test_no_frame_that_passes_is_a_usage_error(tiny_bundle, tiny_run):
     blind = dataclasses.replace(tiny_run.dataset, read_image=lambda _: np.zeros((1, 1), np.uint8))
     with (
         Odometer.load(tiny_bundle) as odometer,
-        pytest.raises(SourceError, match="found none of 2"),
+        pytest.raises(SourceError, match="none of the 2 frames passes"),
     ):
         observe(odometer, blind, np.array([0, 1]))

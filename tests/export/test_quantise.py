@@ -1,4 +1,4 @@
-"""Eight bits: where they are, what is corrected, and that everything stated is of that graph."""
+"""Quantisation: which nodes have 8 bits, bias correction, and figures from the quantised graph."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .conftest import ignore_progress, tiny_config
 
 
 class Maps(nn.Module):
-    """Three convolutions, one of them by channel, whose last feature maps are the output."""
+    """Three convolutions, one of them depthwise; the output is the mean of the last maps."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -36,12 +36,12 @@ class Maps(nn.Module):
         self.first = nn.Conv2d(3, 16, 3, padding=1)
         self.by_channel = nn.Conv2d(16, 16, 3, padding=1, groups=16)
         self.last = nn.Conv2d(16, 8, 1)
-        # As behind a folded normalisation: channels of very different size.
+        # Channels differ greatly in magnitude, as after a folded normalisation.
         with torch.no_grad():
             self.by_channel.weight *= torch.logspace(-1, 1.5, 16)[:, None, None, None]
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Images (n, height, width, 3) -> means of the maps (n, 8)."""
+        """Return the means of the last maps (n, 8) for images (n, height, width, 3)."""
         x = image.permute(0, 3, 1, 2).float() / 127.5 - 1.0
         x = torch.clamp(self.first(x), 0.0, 6.0)
         x = torch.clamp(self.by_channel(x), 0.0, 6.0)
@@ -50,7 +50,7 @@ class Maps(nn.Module):
 
 @pytest.fixture(scope="module")
 def both():
-    """The float32 graph, the quantised one, and feeds that it was made with."""
+    """The float32 graph, the quantised graph, and the feeds used for quantisation."""
     image = torch.zeros((1, 24, 32, 3), dtype=torch.uint8)
     content = export_onnx(Maps().eval(), [image], ["image"], ["features"])
     generator = np.random.default_rng(0)
@@ -65,7 +65,7 @@ def kinds(content):
 
 
 def backbone_graph(normalisation):
-    """A small network as the exporter writes them: pixels scaled first; and feeds."""
+    """Return a small network in the exporter's form, with pixel scaling first, and its feeds."""
     config = BackboneConfig(stages=("8",), grid=(1, 1), normalisation=normalisation)
     torch.manual_seed(0)
     image = torch.zeros((1, 48, 64, 3), dtype=torch.uint8)
@@ -88,13 +88,13 @@ def test_every_convolution_is_in_eight_bits_and_the_first_takes_the_pixels(norma
     for node in convolutions:
         weight = constants[made[node.input[1]].input[0]]
         assert weight.data_type == onnx.TensorProto.INT8
-        # A scale for every channel.
+        # Every channel has its own scale.
         assert list(constants[made[node.input[1]].input[1]].dims) == list(weight.dims[:1])
     pixels = made[convolutions[0].input[0]]
     assert pixels.op_type == "DequantizeLinear"
     assert made[pixels.input[0]].op_type == "Transpose"
     assert not {"Cast", "Sub", "Div"} & set(kinds(small))
-    # No constant is left that nobody reads.
+    # Every remaining constant is used.
     read = {name for node in model.graph.node for name in node.input}
     assert set(constants) <= read
     plain, eight = Session(content, 1), Session(small, 1)
@@ -117,7 +117,7 @@ def test_where_the_graph_begins_otherwise_the_first_convolution_stays_float(both
 
 
 def mean_shift(content, small, feeds):
-    """Largest change of an output's mean over the feeds."""
+    """Return the largest change of an output's mean over the feeds."""
     plain, eight = Session(content, 1), Session(small, 1)
     differences = [eight.run(feed)["features"] - plain.run(feed)["features"] for feed in feeds]
     return float(np.abs(np.mean(differences, axis=0)).max())
@@ -179,5 +179,5 @@ def test_a_backbone_without_constant_weights_is_refused_in_one_line():
     ]
     graph = helper.make_graph(nodes, "g", [x], [y], [w])
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
-    with pytest.raises(UsageError, match=r"expected .* standardised computed"):
+    with pytest.raises(UsageError, match=r"expected .* found computed weights in standardised"):
         quantised(model.SerializeToString(), [{"x": np.zeros((1, 3, 8, 8), np.float32)}])

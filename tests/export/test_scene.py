@@ -1,4 +1,4 @@
-"""Laws of the scene: geometrically exact rendering, and what the sensor does to it."""
+"""Laws of the scene: geometrically exact rendering, and the effects of the sensor."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ def poses():
 
 
 def project(points, pose, camera):
-    """Points (n, 3) -> pixels (n, 2) and depths (n,), as the renderer's docstring states it."""
+    """Project points (n, 3) to pixels (n, 2) and depths (n,), as the renderer documents it."""
     x, y, z = ((points - pose[:3]) @ quaternion_to_matrix(pose[3:])).T
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1), z
 
 
 def rays(pixels, pose, camera):
-    """Pixels (n, 2) -> viewing directions (n, 3) in the world frame, of depth one."""
+    """Return viewing directions (n, 3) of depth 1, in the world frame, for pixels (n, 2)."""
     x, y = ((pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
     return np.stack([x, y, np.ones_like(x)], axis=1) @ quaternion_to_matrix(pose[3:]).T
 
 
 def cast(faces, pixels, pose, camera):
-    """Colour (n, 3) of the nearest face that faces the camera along each ray; NaN where none."""
+    """Return the colour (n, 3) of the nearest visible face along each ray; NaN without a face."""
     directions = rays(pixels, pose, camera)
     nearest = np.full(len(pixels), np.inf)
     colours = np.full((len(pixels), 3), np.nan)
@@ -85,7 +85,7 @@ def test_landmarks_appear_where_they_project(poses, frame):
 
 
 def test_silhouette_is_not_dilated(poses):
-    """A white face covers as much of the image as its projection, with the same centroid."""
+    """A white face has the area and the centroid of its projection."""
     pose = poses[7]
     rotation = quaternion_to_matrix(pose[3:])
     corners = np.array([[-0.5, -0.4, 1.7], [0.6, -0.3, 2.1], [0.4, 0.45, 2.0], [-0.7, 0.35, 1.6]])
@@ -106,7 +106,7 @@ def test_silhouette_is_not_dilated(poses):
 
 @pytest.mark.parametrize("length", [2.3, 2.6, 2.9, 3.2])
 def test_face_reaching_behind_the_camera_is_cut_not_lost(poses, length):
-    """A floor that passes close under the camera fills the image exactly up to its far edge."""
+    """A floor close below the camera fills the image exactly up to its far edge."""
     pose = poses[0]
     corner = np.add(pose[:3], (-4, length - 1, -0.2))
     floor = Face(corner, np.array([8.0, 0, 0]), np.array([0, -length, 0]), WHITE)
@@ -120,7 +120,7 @@ def test_face_reaching_behind_the_camera_is_cut_not_lost(poses, length):
 
 
 def test_a_face_is_seen_from_its_front_only(poses):
-    """Turned round, the same rectangle is invisible."""
+    """The same rectangle is invisible from behind."""
     pose = poses[0]
     rotation = quaternion_to_matrix(pose[3:])
     corner, u, v = np.array([[-1, -1, 2], [2, 0, 0], [0, 2, 0]]) @ rotation.T
@@ -130,7 +130,7 @@ def test_a_face_is_seen_from_its_front_only(poses):
 
 
 def test_a_face_seen_edge_on_hides_nothing():
-    """A camera exactly in the plane of a face looks past it."""
+    """A face whose plane contains the camera hides nothing."""
     pose = np.array([0, 0, 0, 0, 0, 0, 1.0])
     behind = Face(np.array([-1.0, -1, 4]), np.array([2.0, 0, 0]), np.array([0, 2.0, 0]), WHITE)
     edge_on = Face(np.array([0, -1.0, 1]), np.array([0, 2.0, 0]), np.array([0, 0, 3.0]), WHITE)
@@ -143,7 +143,7 @@ def test_a_face_seen_edge_on_hides_nothing():
 
 @pytest.mark.parametrize("frame", [130, 777, 1500, 2222])
 def test_room_agrees_with_ray_casting(poses, frame):
-    """Every pixel shows the nearest surface on its ray; half a pixel aside fits worse."""
+    """Every pixel shows the nearest surface on its ray; rays half a pixel off fit worse."""
     pose = poses[frame]
     image = room().render(pose, CAMERA, SIZE).astype(float)
     pixels = np.random.default_rng(frame).integers((4, 4), (156, 116), (1500, 2))
@@ -161,14 +161,14 @@ def test_room_agrees_with_ray_casting(poses, frame):
 
 
 def test_pure_rotation_is_a_homography(poses):
-    """Turning on the spot warps the image by K R_rel K^-1, whatever the depth."""
+    """A pure rotation warps the image by K R_rel K^-1, independently of depth."""
     camera = Intrinsics(292.5, 292.5, 159.5, 119.5)
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     inside = np.ones((240, 320), np.uint8)
     for frame, turn in ((60, (0.05, -0.12, 0.1)), (900, (-0.08, 0.15, -0.05))):
         pose = poses[frame]
         turned = np.array([*pose[:3], *quaternion_multiply(pose[3:], quaternion_exp(turn))])
-        # p_turned = R_rel^T p, hence the warp takes a pixel of the first image to the second's.
+        # p_turned = R_rel^T p, so the warp maps pixels of the first image to pixels of the second.
         relative = quaternion_to_matrix(quaternion_exp(turn))
         warp = matrix @ relative.T @ np.linalg.inv(matrix)
         first, second = (room().render(p, camera, (320, 240)) for p in (pose, turned))

@@ -1,4 +1,4 @@
-"""No frame has two roles; gaps, shares, sequences and digests."""
+"""Splits: each frame has at most one role; gaps, shares, sequences and digests."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def test_no_frame_has_two_roles_and_every_role_has_frames(lengths, kind, seed):
     try:
         split = make_split(made, kind, seed)
     except UsageError:
-        assert kind == "block"  # short recordings may not survive the gaps
+        assert kind == "block"  # too few frames of a short recording may remain after the gaps
         return
     joined = np.concatenate([split.roles[role] for role in ROLES])
     assert len(set(joined.tolist())) == joined.size
@@ -170,5 +170,5 @@ def test_folds_of_one_recording_are_runs_of_frames():
     indices = np.concatenate([split.roles["train"], split.roles["fit"]])
     for fold in deal_folds(made, split, indices, 3):
         frames = np.sort(indices[fold])
-        # A fold begins and ends seldom: its frames follow one another.
+        # A fold consists of few runs of consecutive frames.
         assert (np.diff(frames) > 1).sum() < 0.1 * frames.size

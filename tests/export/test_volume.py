@@ -1,4 +1,4 @@
-"""Volumes of unions against closed forms."""
+"""Volumes of unions of balls and ellipsoids against closed forms."""
 
 import math
 
@@ -28,7 +28,7 @@ def test_balls_that_are_apart_add_up(d):
 
 
 def test_two_discs_that_overlap_are_their_lens_short():
-    # Circles of radius 1 at a distance of 1 share 2 acos(1/2) - sqrt(3)/2.
+    # Discs of radius 1 at a distance of 1 share an area of 2 acos(1/2) - sqrt(3)/2.
     centres = np.array([[0.0, 0.0], [1.0, 0.0]])
     expected = 2 * math.pi - (2 * math.acos(0.5) - math.sqrt(3) / 2)
     assert union_log_volume(centres, 1.0, 0, draws=200_000) == pytest.approx(
@@ -45,7 +45,7 @@ def test_a_union_grows_with_its_radius_and_is_nothing_without_one():
 
 
 def test_errors_of_frames_with_seeds_of_their_own_average_out():
-    # One union of as many points as a codebook has; many draws tell its volume.
+    # A union of as many balls as a codebook has points; many draws give the reference volume.
     centres = np.random.default_rng(3).standard_normal((385, 6))
     exact = union_log_volume(centres, 1.5, 0, draws=100_000)
     found = [union_log_volume(centres, 1.5, seed) for seed in range(1, 41)]
@@ -62,7 +62,7 @@ def test_an_ellipsoid_has_the_volume_of_its_ball_times_the_determinant():
 
 
 def test_the_estimate_is_the_share_of_a_box_that_lies_inside():
-    # An independent estimator: points of a box, asked one by one.
+    # Independent estimator: the share of uniform points in a box that lie in the region.
     generator = np.random.default_rng(2)
     scale = np.tril(generator.normal(0.0, 0.2, (6, 6))) + np.eye(6)
     region = Ellipsoids(generator.standard_normal((30, 6)), scale, 1.2)

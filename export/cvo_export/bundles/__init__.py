@@ -1,1 +1,1 @@
-"""From a network to a bundle: scores, thresholds, drafts and writing."""
+"""Build bundles from networks: drafts, scores, thresholds, figures and writing."""

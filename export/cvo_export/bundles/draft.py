@@ -1,4 +1,4 @@
-"""A bundle before it is calibrated: all that is known without a score or a threshold."""
+"""A bundle before calibration: everything that does not depend on a score or a threshold."""
 
 from __future__ import annotations
 
@@ -42,20 +42,21 @@ Array = NDArray[np.float64]
 
 WORLD_FRAME, CAMERA_FRAME = "world", "camera"
 
-# Beyond this spread about the mean rotation the tangent at it comes near its cut at pi.
+# With a larger spread about the mean rotation, tangent coordinates come close to their
+# discontinuity at pi.
 MAX_SPREAD_RAD = 2.0
 # Least half-width in the normalised score, in standard deviations of each DoF.
 HALF_WIDTH_FLOOR = 0.01
 _LEAST_DEVIATION = 1e-6
 
-# How far beyond the known poses a pose is still plausible, in ranges of each DoF.
+# Margin of plausible poses around the known ones, as a share of each DoF's range.
 _LIMIT_MARGIN = 0.5
-# The same in metres and radians, where the known poses may be few.
+# Least margin in metres and radians where there may be few known poses.
 FEW_POSES_MARGIN = 1.0
-# Metres, radians, probabilities. In 8 bits a rounding that falls to the other side on another kind
-# of processor moves outputs by up to .005, saturated products by more than .015 (boards/).
+# Metres, radians, probabilities. In 8 bits, different rounding on another kind of processor moves
+# outputs by up to 0.005; saturated products move them by more than 0.015 (see boards/).
 _SELFTEST_TOLERANCE: dict[Precision, float] = {"fp32": 1e-3, "int8": 1e-2}
-# What works on 8-bit numbers.
+# Operators on 8-bit numbers.
 _QUANTISED = {
     "ConvInteger",
     "DynamicQuantizeLinear",
@@ -65,21 +66,21 @@ _QUANTISED = {
     "QLinearMatMul",
     "QuantizeLinear",
 }
-# Height and width of the self-test's image: of another shape than any camera and model, so that
-# resize and crop are tested, too.
+# Height and width of the self-test image. No camera and no model has this shape, so the self-test
+# covers resizing and cropping too.
 SELFTEST_SIZE = (418, 650)
 
 
 @dataclass(frozen=True)
 class Draft:
-    """What a bundle says that does not depend on its calibration; see ``Calibration``.
+    """The part of a bundle that does not depend on its calibration; see ``Calibration``.
 
     Attributes
     ----------
     method
-        Name of the runtime's head.
+        Name of the runtime head.
     rule, joint, split, dataset
-        How thresholds are to be made, and of which frames.
+        How to compute the thresholds, and from which frames.
     """
 
     name: str
@@ -95,7 +96,7 @@ class Draft:
 
     @classmethod
     def of(cls, calibration: Calibration) -> Draft:
-        """Return the draft of a bundle, to be calibrated again."""
+        """Return the draft of an existing bundle, to calibrate it again."""
         source = calibration.calibration
         return cls(
             name=calibration.name,
@@ -111,16 +112,16 @@ class Draft:
         )
 
     def head(self, candidate: Candidate) -> Head:
-        """Return the method with one of its scores.
+        """Return the method's head with one of its scores.
 
-        Raises BundleMismatchError where the model does not have the tensors that it works with.
+        Raises BundleMismatchError if the model does not have the tensors that the head needs.
         """
         head = HEADS[self.method](candidate.parameters, candidate.score)
         check_tensors(self.model, head)
         return head
 
     def observer(self, model_bytes: bytes, head: Head) -> Observer:
-        """Return what runs the network on frames; raises ModelError and BundleMismatchError."""
+        """Return an observer that runs the network; raises ModelError and BundleMismatchError."""
         return Observer(model_bytes, self.model, self.preprocess, self.pose, head)
 
     def calibrated(
@@ -130,9 +131,9 @@ class Draft:
         counts: Counts,
         selftest: Mapping[str, tuple[float, ...]],
     ) -> Calibration:
-        """Return the whole of ``calibration.json``, without the digest that writing gives it.
+        """Return the content of ``calibration.json``; the digest is set when it is written.
 
-        ``selftest``: each output of the network for the image of the self-test.
+        ``selftest`` holds the network's outputs for the self-test image, by name.
         """
         height, width = SELFTEST_SIZE
         return Calibration(
@@ -167,7 +168,7 @@ class Draft:
 
 
 class Counts(NamedTuple):
-    """What thresholds are of: frames, sequences, and the independent frames they are worth."""
+    """Size of a calibration sample: frames, sequences and effective (independent) frames."""
 
     frames: int
     sequences: int
@@ -175,7 +176,7 @@ class Counts(NamedTuple):
 
 
 def model_spec(model_bytes: bytes, opset: int, provider: Provider = "onnxruntime") -> ModelSpec:
-    """What the calibration says of a model; one that quantises anything is an int8 model."""
+    """Describe a model for ``calibration.json``; any quantised operator makes it int8."""
     session = Session(model_bytes)
     return ModelSpec(
         file=MODEL_FILE,
@@ -194,16 +195,17 @@ def _precision(model_bytes: bytes) -> Precision:
 
 
 def known_coordinates(poses: Array, reference_q_xyzw: Array) -> Array:
-    """Poses (n, 7) -> position and tangent at a reference rotation, (n, 6), m and rad."""
+    """Convert poses (n, 7) to position and tangent at a reference rotation, (n, 6), m and rad."""
     return Chart("tangent_reference", reference_q_xyzw).coordinates(poses, poses)
 
 
 def known_space(
     poses: Array,
 ) -> tuple[Quaternion | None, PoseLimits, SixPositive]:
-    """Mean rotation, plausible limits in the tangent there, and deviation, of known poses (n, 7).
+    """Return mean rotation, plausible limits and standard deviation of known poses (n, 7).
 
-    The rotation is None where they spread too far for one tangent.
+    Limits and deviation are in the tangent at the mean rotation. The rotation is None if the poses
+    spread too far for one tangent.
     """
     reference = geometry.mean_rotation(poses[:, 3:])
     coordinates = known_coordinates(poses, reference)
@@ -216,9 +218,10 @@ def known_space(
 
 
 def plausible(coordinates: Array, least_margin: float = 0.0) -> PoseLimits:
-    """Limits around known poses (n, 6), half of their range wider on each side.
+    """Return limits half a range beyond the known poses (n, 6) on each side.
 
-    At least by ``least_margin``, metres and radians: few poses span little of where a camera goes.
+    The margin is at least ``least_margin``, in metres and radians, because a few poses cover only
+    part of where a camera goes.
     """
     lowest, highest = coordinates.min(axis=0), coordinates.max(axis=0)
     margin = np.maximum(_LIMIT_MARGIN * (highest - lowest), least_margin)
@@ -226,17 +229,17 @@ def plausible(coordinates: Array, least_margin: float = 0.0) -> PoseLimits:
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Version of each installed package, for the provenance."""
+    """Return the version of each installed package, for the provenance."""
     return {package: importlib.metadata.version(package) for package in packages}
 
 
 def four(values: Array) -> Quaternion:
-    """Shape (4,) -> a quaternion."""
+    """Convert an array (4,) to a quaternion."""
     x, y, z, w = (float(value) for value in values)
     return (x, y, z, w)
 
 
 def six(values: Array) -> Six:
-    """Shape (6,) -> six numbers."""
+    """Convert an array (6,) to a tuple of six numbers."""
     a, b, c, d, e, f = (float(value) for value in values)
     return (a, b, c, d, e, f)

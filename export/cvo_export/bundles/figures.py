@@ -21,9 +21,9 @@ from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
 
-# Of coverage: a band that holds, one that would if frames were independent draws, or none.
+# Coverage bands: exact, valid only if frames were independent draws, or not given.
 Claim = Literal["exact", "indicative", "none"]
-# The band that a valid method's coverage stays in with this probability.
+# Probability with which the coverage of a valid method lies within the band.
 _BAND_PROBABILITY = 0.99
 _LEAST_WIDTH = 1e-3
 _ROUNDING = 1e-9
@@ -31,7 +31,7 @@ _LARGEST_LOG = 700.0
 
 
 def point_error(seen: Observed) -> dict[str, float]:
-    """Median and 90 % quantile of position (m) and angle (deg) of the point estimate."""
+    """Return the median and the 90 % quantile of the position (m) and rotation (deg) errors."""
     distance = np.linalg.norm(seen.pose[:, :3] - seen.true_pose[:, :3], axis=1)
     difference = geometry.quaternion_multiply(
         geometry.quaternion_conjugate(seen.pose[:, 3:]), seen.true_pose[:, 3:]
@@ -46,11 +46,12 @@ def point_error(seen: Observed) -> dict[str, float]:
 
 
 def set_log_volume(found: ConformalSet, deviation: Array, seed: int) -> float:
-    """Logarithm of the volume in which all six degrees of freedom lie, in standardised units.
+    """Return the logarithm of the volume of a six-DoF set, in standardised units.
 
-    The product of six sets, or a union of ellipsoids. ``deviation`` (6,): standard deviation of
-    each degree of freedom's poses, m and rad; ``seed`` of the estimate, one for each frame. A set
-    without width counts as a thousandth of the deviation: a single one would make all volumes 0.
+    The set is a product of six sets or a union of ellipsoids. ``deviation`` (6,) is the standard
+    deviation of the known poses per DoF, m and rad. ``seed`` is the seed of the Monte Carlo
+    estimate; use a different one for each frame. A width of 0 counts as a thousandth of the
+    deviation, because a single zero would make the mean volume of all frames 0.
     """
     box = np.log(np.maximum(found.width() / deviation, _LEAST_WIDTH)).sum()
     if found.ellipsoids is None:
@@ -60,9 +61,9 @@ def set_log_volume(found: ConformalSet, deviation: Array, seed: int) -> float:
 
 
 def adaptiveness(width: Array, error: Array) -> dict[str, float | None]:
-    """Widths and absolute errors (n, 6) -> ``Sets.adaptiveness``."""
+    """Compute ``Sets.adaptiveness`` from widths and absolute errors (n, 6)."""
     third = len(error) // 3
-    # What differs by rounding alone is one width.
+    # Widths that differ only by rounding count as equal.
     if third == 0 or not np.all(np.ptp(width, axis=0) > _ROUNDING * np.abs(width).max(axis=0)):
         return {"width_ratio": None, "rank_correlation": None}
     ratios, correlations = [], []
@@ -79,11 +80,11 @@ def adaptiveness(width: Array, error: Array) -> dict[str, float | None]:
 
 
 def coverage_band(n_calibration: int, n_test: int, confidence: float) -> list[float] | None:
-    """Central 99 % of the coverage of ``n_test`` frames by an exchangeable calibration.
+    """Return the central 99 % of the coverage of ``n_test`` frames exchangeable with calibration.
 
     With n scores and rank k, coverage given the calibration is Beta(k, n + 1 - k), so the number
-    covered is Beta-binomial (Angelopoulos and Bates 2021, section 3.2). None where k > n: the set
-    is everything.
+    of covered frames is Beta-binomial (Angelopoulos and Bates 2021, section 3.2). None if k > n,
+    because the set is then unbounded.
     """
     k = conformal_rank(n_calibration, confidence)
     if k > n_calibration or n_test < 1:
@@ -95,9 +96,10 @@ def coverage_band(n_calibration: int, n_test: int, confidence: float) -> list[fl
 
 @dataclass(frozen=True)
 class Sets:
-    """The sets of all observed frames at the thresholds of a calibration, and what it claims.
+    """The sets of all observed frames at the thresholds of a calibration.
 
-    The calibration is the odometer's own, or that with other thresholds.
+    ``calibration`` is the odometer's own, possibly with other thresholds; ``claim`` says how far
+    its coverage band can be trusted.
     """
 
     odometer: Odometer
@@ -107,20 +109,20 @@ class Sets:
 
     @cached_property
     def effective(self) -> float:
-        """Independent frames that the observed ones are worth."""
+        """Effective number of independent frames among the observed ones."""
         return effective_frames(self.seen.scored(self.odometer.head))
 
     @property
     def deviation(self) -> Array:
-        """Standard deviation of each DoF of the known poses, (6,), m and rad."""
+        """Standard deviation of the known poses per DoF, (6,), m and rad."""
         return np.array(self.calibration.pose.standard_deviation)
 
     def covered(self, sets: list[ConformalSet]) -> NDArray[np.bool_]:
-        """Which true numbers lie in these sets, (n, 6)."""
+        """Return whether each true value lies in its set, (n, 6)."""
         return np.array([each.covers(y) for each, y in zip(sets, self.seen.truth, strict=True)])
 
     def covered_jointly(self, sets: list[ConformalSet]) -> float:
-        """Share of frames whose true numbers lie in these sets all six at once."""
+        """Return the share of frames whose set contains all six true values."""
         pairs = zip(sets, self.seen.truth, strict=True)
         return float(np.mean([each.contains(y) for each, y in pairs]))
 
@@ -140,8 +142,8 @@ class Sets:
         one_bound = len(used) < len(self.odometer.head.side_confidences(0.9))
         # A single bound is penalised by 1/alpha, an interval by 2/alpha.
         alpha = (1.0 - entry.confidence) * (2.0 if one_bound else 1.0)
-        # The band is that of one order statistic of frames: it says nothing of a rule that counts
-        # sequences, of two thresholds a set, or of six that hold together by Bonferroni.
+        # The band describes one order statistic of frame scores. It does not apply to a rule that
+        # counts sequences, to sets with two thresholds, or to Bonferroni's six joint sets.
         banded = (
             self.claim != "none"
             and self.calibration.calibration.rule == "pooled"
@@ -176,7 +178,10 @@ class Sets:
         }
 
     def widths(self, sets: list[ConformalSet], alpha: float) -> dict[str, Any]:
-        """Widths and interval score (6,) of bounded sets, and its mean over the deviations."""
+        """Return widths and interval scores (6,) of bounded sets, and the standardised score.
+
+        The standardised score is the mean over the DoF of interval score / standard deviation.
+        """
         width = np.array([each.width() for each in sets])
         distance = np.array(
             [each.distance(y) for each, y in zip(sets, self.seen.truth, strict=True)]
@@ -190,11 +195,12 @@ class Sets:
         }
 
     def adaptiveness(self, sets: list[ConformalSet]) -> dict[str, float | None]:
-        """How far widths follow the point's errors, mean over the degrees of freedom.
+        """Return how closely widths follow the point errors, averaged over the DoF.
 
-        ``width_ratio``: mean width on the third of the frames with the largest errors over that on
-        the third with the least; ``rank_correlation``: Spearman's, of width and error. None where a
-        degree of freedom has one width for all frames, or none at all, and with too few frames.
+        ``width_ratio`` is the mean width of the third of the frames with the largest errors over
+        the mean width of the third with the smallest; ``rank_correlation`` is Spearman's, between
+        width and error. Both are None if the widths of some DoF are constant or zero, or if there
+        are fewer than three frames.
         """
         return adaptiveness(
             np.array([each.width() for each in sets]),
@@ -202,11 +208,11 @@ class Sets:
         )
 
     def volumes(self, sets: list[ConformalSet]) -> dict[str, Any]:
-        """Return volumes of the joint sets of all frames, bounded, in standardised units."""
+        """Return the volumes of the bounded joint sets over all frames, in standardised units."""
         logarithm = np.array(
             [set_log_volume(each, self.deviation, seed) for seed, each in enumerate(sets)]
         )
-        # No number of JSON is larger.
+        # A larger logarithm would overflow to infinity, which JSON cannot store.
         volume = np.exp(np.minimum(logarithm, _LARGEST_LOG))
         return {
             "joint_volume": {
@@ -217,9 +223,9 @@ class Sets:
         }
 
     def own(self) -> dict[str, Any] | None:
-        """Return the figures of the network's own bounds, taken as 90 %, before any threshold.
+        """Return the figures of the network's own uncalibrated bounds at 90 %.
 
-        None for a network that gives none.
+        None for a network without bounds.
         """
         sets = self.odometer.head.own_sets(self.seen.outputs, self.seen.point)
         if not sets:
@@ -232,7 +238,10 @@ class Sets:
         }
 
     def pieces(self, sets: list[ConformalSet]) -> dict[str, Any]:
-        """For sets that may be in pieces: how often there is a gap (6,), and in any of the six."""
+        """Return how often sets are disjoint: per DoF (6,), and in at least one DoF of a frame.
+
+        Empty for methods whose sets are always intervals.
+        """
         if any(each.bands is None for each in sets):
             return {}
         gaps = np.array([[len(row) > 1 for row in each.bands or ()] for each in sets])
@@ -242,7 +251,7 @@ class Sets:
         }
 
     def sequences(self, dataset: PoseDataset) -> dict[str, dict[str, Any]]:
-        """Coverage of each sequence at 0.9, marginal thresholds and the joint ones."""
+        """Return the coverage of each sequence at 0.9, with marginal and with joint thresholds."""
         marginal = self.calibration.threshold(0.9, "marginal")
         joint = self.calibration.threshold(0.9, "joint")
         if marginal is None or joint is None:

@@ -1,7 +1,7 @@
-"""Scores by running the exported model through the runtime -> thresholds.
+"""Compute thresholds from scores of the exported model, run through the runtime.
 
-Coverage then depends on no fidelity of the export: whatever the graph computes (8-bit included) is
-what was calibrated.
+Coverage then does not depend on the fidelity of the export: the graph that runs on the device,
+8-bit or not, is the graph that was calibrated.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from cvo_export.datasets import PoseDataset
 Array = NDArray[np.float64]
 
 
-# What another score has to win on val by: smaller differences there are chance.
+# Least relative gain on val for choosing another score; smaller differences may be chance.
 _CLEARLY = 0.05
 
 
 class Scored(NamedTuple):
-    """Scores of n frames of each scope, (n, sides, 6), and their sequence numbers (n,)."""
+    """Scores of n frames per scope, (n, sides, 6), and the frames' sequence numbers (n,)."""
 
     marginal: Array
     joint: Array
@@ -48,11 +48,11 @@ class Scored(NamedTuple):
 
 @dataclass(frozen=True)
 class Observed:
-    """Frames that passed the frame checks, as the runtime sees them, stacked over n frames.
+    """The runtime's results for the n frames that passed the frame checks, stacked.
 
-    ``outputs`` by name (n, ...); ``point`` (n, 6) and ``truth`` (n, 6) in the bundle's chart;
-    ``pose`` (n, 7) and ``true_pose`` (n, 7); ``sequence`` (n,) the sequence number; ``invalid``
-    and ``degraded`` count the frames that the checks left out.
+    ``outputs`` (n, ...) are the network's outputs by name; ``point`` and ``truth`` (n, 6) are in
+    the bundle's chart; ``pose`` and ``true_pose`` are (n, 7); ``sequence`` (n,) holds sequence
+    numbers; ``invalid`` and ``degraded`` count the frames that the checks excluded.
     """
 
     indices: NDArray[np.int64]
@@ -73,7 +73,7 @@ class Observed:
         return Scored(marginal, joint, self.sequence)
 
     def sets(self, head: Head, entry: Threshold) -> list[ConformalSet]:
-        """Return the set of every frame at a threshold."""
+        """Return the set of every frame at one threshold entry."""
         return [
             head.conformal_set(
                 {name: values[row : row + 1] for name, values in self.outputs.items()},
@@ -89,7 +89,7 @@ def observe(
 ) -> Observed:
     """Run frames of a data set through a network, in order.
 
-    Raises SourceError where no frame passes the checks.
+    Raises SourceError if no frame passes the checks.
     """
     kept: list[int] = []
     seen: list[Observation] = []
@@ -98,7 +98,7 @@ def observe(
         try:
             image = dataset.read_image(index)
         except SourceError:
-            image = None  # flagged as it would be on the device
+            image = None  # flagged as invalid, as on the device
         observation = observer.observe(image, seq=index)
         if observation.fault is not None:
             invalid += 1
@@ -109,7 +109,7 @@ def observe(
             seen.append(observation)
     if not seen:
         raise SourceError(
-            f"{dataset.name}: expected frames that pass the checks, found none of {len(indices)}"
+            f"{dataset.name}: none of the {len(indices)} frames passes the frame checks"
         )
     pose = np.array([observation.pose for observation in seen])
     true_pose = dataset.poses[kept]
@@ -138,23 +138,23 @@ def calibrated(
 ) -> Calibration:
     """Calibrate a draft: run its model on val and cal, choose a score, compute thresholds.
 
-    val decides among the candidates, see ``chosen``, and compares degrees of freedom for the joint
-    scope; cal gives the thresholds.
+    The val frames choose among the candidates (see ``chosen``) and scale the degrees of freedom
+    for the joint scope; the cal frames give the thresholds.
 
     Raises
     ------
     BundleMismatchError, CalibrationFileError
-        The model or a candidate is not of the draft's method.
+        The model or a candidate does not fit the draft's method.
     SourceError
         No frame of val or cal passes the checks.
     UsageError
-        Bonferroni's joint scope with a method that has one score for all six.
+        Bonferroni's joint scope with a method that has one score for all six degrees of freedom.
     """
     first = draft.head(candidates[0])
     if draft.joint == "bonferroni" and first.one_joint_score:
         raise UsageError(
-            f"joint: expected max for {draft.method}, which has one score for all six, found "
-            "bonferroni"
+            f"joint: expected max for {draft.method}, which has one score for all six degrees of "
+            "freedom, found bonferroni"
         )
     with draft.observer(model_bytes, first) as observer:
         val = observe(observer, dataset, roles["val"])
@@ -172,9 +172,9 @@ def calibrated(
 def with_thresholds(
     calibration: Calibration, head: Head, val: Observed, cal: Observed
 ) -> Calibration:
-    """Return a calibration with the thresholds of these observations, and their counts.
+    """Return a calibration with thresholds and counts from these observations.
 
-    Rule, joint scope and score stay; val compares degrees of freedom for the joint scope.
+    Rule, joint scope and score stay; val scales the degrees of freedom for the joint scope.
     """
     source, scored = calibration.calibration, cal.scored(head)
     found = counts(scored)
@@ -191,7 +191,7 @@ def with_thresholds(
 
 
 def counts(cal: Scored) -> Counts:
-    """Return how many frames and sequences scores are of, and what they are worth."""
+    """Count the frames, sequences and effective frames behind calibration scores."""
     return Counts(
         frames=len(cal.sequence),
         sequences=len(np.unique(cal.sequence)),
@@ -202,7 +202,7 @@ def counts(cal: Scored) -> Counts:
 def selected(
     candidates: Sequence[Candidate], score: str | None, sides: Sides | None
 ) -> tuple[Candidate, ...]:
-    """Return the candidates of this score, all if it is None, with these sides, if not None.
+    """Return the candidates with this score and these sides; None leaves the choice open.
 
     Raises UsageError for a score or sides that the method does not have.
     """
@@ -213,7 +213,7 @@ def selected(
     if sides is None or (sides == "symmetric" and "sides" not in _names(kept[0])):
         return tuple(kept)
     if any("sides" not in _names(candidate) for candidate in kept):
-        raise UsageError(f"sides: expected symmetric, as the method has no others, found {sides}")
+        raise UsageError(f"sides: expected symmetric, this method's only choice, found {sides}")
     return tuple(c._replace(parameters=replace(c.parameters, sides=sides)) for c in kept)
 
 
@@ -222,10 +222,10 @@ def _names(candidate: Candidate) -> tuple[str, ...]:
 
 
 def chosen(draft: Draft, val: Observed, candidates: Sequence[Candidate]) -> Candidate:
-    """Return the first candidate, unless another's sets on val, thresholded there, clearly win.
+    """Return the candidate to use: the first, unless another is clearly better on val.
 
-    By the interval score at 0.9 over each DoF's deviation; val is too small to tell closer ones
-    apart.
+    Candidates are compared by the interval score at 0.9 over each DoF's standard deviation, with
+    thresholds from val itself; val is too small to separate closer candidates.
     """
     results = []
     for candidate in candidates:
@@ -243,11 +243,11 @@ def chosen(draft: Draft, val: Observed, candidates: Sequence[Candidate]) -> Cand
 
 
 def workspace(pose: PoseSpec) -> tuple[Array, Array]:
-    """Lowest and highest value per DoF, (6,) each, that stand in for an unbounded side."""
+    """Return the lowest and highest value per DoF, (6,) each, that replace unbounded sides."""
     limits = pose.limits
     lowest, highest = np.array(limits.lowest), np.array(limits.highest)
     if pose.rotation == "tangent_predicted":
-        # Offsets about the prediction: at most a half turn.
+        # Offsets from the prediction: at most half a turn.
         lowest[3:], highest[3:] = -np.pi, np.pi
     return lowest, highest
 
@@ -255,12 +255,12 @@ def workspace(pose: PoseSpec) -> tuple[Array, Array]:
 def thresholds(
     head: Head, cal: Scored, val: Scored, rule: Rule, joint: Joint
 ) -> tuple[Threshold, ...]:
-    """Both scopes at every confidence, from scores on cal.
+    """Return the thresholds of both scopes at every confidence, from scores on cal.
 
-    ``pooled`` counts frames, ``hierarchical`` sequences; what too few of them cannot support is
-    unbounded (null). Joint scope: ``max``, the largest score of a frame, made comparable on val;
-    or ``bonferroni``, six sets at a sixth of the miscoverage each. Scores that are one for all six
-    are equal and stay so.
+    ``pooled`` counts frames, ``hierarchical`` counts sequences; with too few of them a threshold
+    is unbounded (null). The joint scope ``max`` uses each frame's largest score, after scaling
+    that makes the degrees of freedom comparable on val; ``bonferroni`` uses six sets at a sixth of
+    the miscoverage each. A method with one score for all six gets the same threshold six times.
     """
 
     def q_hat(scores: Array, confidence: float) -> float:
@@ -288,7 +288,7 @@ def thresholds(
 def marginal_thresholds(
     head: Head, scores: Array, confidence: float, q_hat: Callable[[Array, float], float]
 ) -> Array:
-    """Scores (n, sides, 6) -> thresholds (sides, 6), infinite where unbounded."""
+    """Return thresholds (sides, 6) from scores (n, sides, 6); infinite where unbounded."""
     found = np.full(scores.shape[1:], np.inf)
     for side, level in enumerate(head.side_confidences(confidence)):
         if level is not None:
@@ -297,10 +297,10 @@ def marginal_thresholds(
 
 
 def effective_frames(scored: Scored) -> float:
-    """Independent frames that marginal scores are worth: the least over all columns.
+    """Return the effective sample size of marginal scores: the least over all columns.
 
-    Summed over sequences, which are independent of each other. An infinite score counts as the
-    largest finite one.
+    Sizes are summed over sequences, which are independent of each other. An infinite score counts
+    as the largest finite one.
     """
     columns = [
         np.minimum(column, column[np.isfinite(column)].max(initial=0.0))
@@ -322,7 +322,7 @@ def _pooled(scores: Array, confidence: float) -> float:
 
 
 def _threshold(confidence: float, scope: Scope, values: Array) -> Threshold:
-    """Thresholds (sides, 6), infinite where unbounded, as they are stored."""
+    """Convert thresholds (sides, 6), infinite where unbounded, to a stored entry."""
     sides = [_six_or_unbounded(row) for row in values]
     return Threshold(
         confidence=confidence,

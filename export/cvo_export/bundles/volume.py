@@ -1,4 +1,4 @@
-"""How large a region is: the volume of a union of balls, by counting overlaps."""
+"""Volume of a region: a Monte Carlo estimate for a union of balls or ellipsoids."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ _DRAWS = 1000
 
 
 def union_log_volume(centres: Array, radius: float, seed: int, draws: int = _DRAWS) -> float:
-    """Logarithm of the volume of balls of one radius about centres (J, d).
+    """Return the logarithm of the volume of a union of balls of one radius about centres (J, d).
 
-    J times one ball's volume counts a point once for every ball that holds it; so it is multiplied
-    by E[1/m], where m is that number for a point drawn from a ball drawn at random (Karp, Luby and
-    Madras 1989). Give every frame a seed of its own: then errors of the estimates average out.
+    J times the volume of one ball counts every point once per ball that contains it. The estimate
+    multiplies it by E[1/m], where m is that number of balls for a uniform point in a random ball
+    (Karp, Luby and Madras 1989). Use a different seed for each frame, so that the errors of the
+    estimates average out.
     """
     count, d = centres.shape
     if radius <= 0.0:
@@ -32,7 +33,7 @@ def union_log_volume(centres: Array, radius: float, seed: int, draws: int = _DRA
     reach = radius * generator.random((draws, 1)) ** (1.0 / d)
     drawn = centres[generator.integers(count, size=draws)]
     points = drawn + reach * direction
-    # |p - c|^2 about the middle, so that the difference of squares keeps its digits.
+    # Shift |p - c|^2 to the mean, so that the difference of squares does not lose digits.
     middle = centres.mean(axis=0)
     p, c = points - middle, centres - middle
     squared = (p**2).sum(axis=1)[:, np.newaxis] + (c**2).sum(axis=1) - 2.0 * p @ c.T
@@ -43,7 +44,7 @@ def union_log_volume(centres: Array, radius: float, seed: int, draws: int = _DRA
 
 
 def ellipsoids_log_volume(region: Ellipsoids, seed: int) -> float:
-    """Logarithm of the volume of a union of ellipsoids, in the units of its chart: m^3 rad^3."""
+    """Return the logarithm of the volume of a union of ellipsoids, in m^3 rad^3."""
     solved = np.linalg.solve(region.scale, region.centres.astype(np.float64).T)
     centres = np.asarray(solved.T, np.float64)
     log_determinant = float(np.log(np.abs(np.diag(region.scale))).sum())

@@ -1,4 +1,4 @@
-"""A bundle folder, written whole or not at all."""
+"""Write bundle folders atomically."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cvo_edge.programs.selftest import check_selftest
 
 
 def check_target(bundle_dir: Path) -> None:
-    """Raise SinkError where the folder holds something that is no bundle."""
+    """Raise SinkError if the folder contains files that do not belong to a bundle."""
     own = {CALIBRATION_FILE, MODEL_FILE}
     if bundle_dir.exists() and not (
         bundle_dir.is_dir() and {path.name for path in bundle_dir.iterdir()} in (own, set())
@@ -25,7 +25,7 @@ def check_target(bundle_dir: Path) -> None:
 
 
 def write_bundle(bundle_dir: Path, calibration: Calibration, model_bytes: bytes) -> Calibration:
-    """Write beside the target, verify by reading and self-test, then move into place.
+    """Write to a temporary folder next to the target, read and self-test it, move it into place.
 
     Raises
     ------

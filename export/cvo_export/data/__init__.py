@@ -1,1 +1,1 @@
-"""What happens to a data set before training: splits, augmentation and noise."""
+"""Preparation of data sets: splits, augmentation and noise."""

@@ -1,8 +1,9 @@
-"""Training images whose labels are known exactly: camera rotations, and changes of light.
+"""Augmentation with exact labels: camera rotations and changes of light.
 
-A camera that only turns sees the same rays through other pixels: with ``R' = R A`` (R the
-camera-to-world rotation, A a rotation in the camera frame) the new image is the old one under the
-homography K A^T K^-1, whatever the scene's depth. Position cannot be augmented that way.
+When a camera only rotates, the same rays pass through other pixels. With ``R' = R A`` (R the
+camera-to-world rotation, A a rotation in the camera frame), the new image is the old one warped by
+the homography K A^T K^-1, independently of the scene's depth. Position cannot be augmented this
+way.
 """
 
 from __future__ import annotations
@@ -22,34 +23,34 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """How strongly a training image is changed at most.
+    """Greatest strength of the changes to a training image.
 
-    Copies are graded: the first hardly differs, the last in full. Weak changes keep a network
-    precise between neighbouring frames, strong ones carry it to new sequences; a data set needs
-    one or the other, and graded copies serve both.
+    The strength grows from copy to copy, up to the full strength in the last one. Weak changes
+    keep a network precise between neighbouring frames; strong changes help it generalise to new
+    sequences. Data sets differ in which they need, and graded copies provide both.
 
     Attributes
     ----------
     rotation_deg
         Standard deviation of the rotation vector, per axis of the camera.
     light
-        Scale of the changes of gain, gamma, colour, blur and noise; 0 for none, 1 for the usual.
+        Scale of the changes of gain, gamma, colour, blur and noise; 0 disables them, 1 is normal.
     """
 
     rotation_deg: float = 6.0
     light: float = 1.0
 
     def graded(self, share: float) -> AugmentConfig:
-        """Return this share, 0 to 1, of the strength."""
+        """Return a configuration with this share, 0 to 1, of the strength."""
         return AugmentConfig(share * self.rotation_deg, share * self.light)
 
 
 def model_intrinsics(
     intrinsics: Intrinsics, image_shape: tuple[int, ...], height: int, width: int, crop: str
 ) -> NDArray[np.float64]:
-    """Camera matrix K (3, 3) of the model's input, given the camera image's own intrinsics.
+    """Return the camera matrix K (3, 3) of the model input, from the camera image's intrinsics.
 
-    Pixel centres are at whole numbers, so that scaling shifts the principal point by half pixels.
+    Pixel centres have integer coordinates, so scaling shifts the principal point by half pixels.
     """
     top, bottom, left, right = preprocess.crop_box(
         image_shape[0], image_shape[1], height, width, "centre" if crop == "centre" else "none"
@@ -62,13 +63,13 @@ def model_intrinsics(
 
 
 def rotate_camera(image: Image, K: NDArray[np.float64], q_camera: NDArray[np.float64]) -> Image:
-    """The image (height, width, 3) that the camera would see after turning by ``q_camera`` (4,).
+    """Return the image (height, width, 3) that the camera would see rotated by ``q_camera`` (4,).
 
-    ``R_new = R @ A`` with A the rotation of the quaternion, in the camera frame. Pixels that the
-    first image does not have are reflected at its border.
+    ``R_new = R @ A``, where A is the quaternion's rotation in the camera frame. Pixels outside the
+    original image are filled by reflection at its border.
     """
     A = geometry.quaternion_to_matrix(q_camera)
-    # A ray d in the new camera is A d in the old one: this maps new pixels to old ones.
+    # A ray d in the new camera is A d in the old one, so this maps new pixels to old pixels.
     new_to_old = K @ A @ np.linalg.inv(K)
     size = (image.shape[1], image.shape[0])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -79,7 +80,7 @@ def rotate_camera(image: Image, K: NDArray[np.float64], q_camera: NDArray[np.flo
 
 
 def change_light(image: Image, strength: float, generator: np.random.Generator) -> Image:
-    """Random gain, gamma, colour balance, blur and noise; shape and type stay."""
+    """Apply random gain, gamma, colour balance, blur and noise; keeps shape and type."""
     gamma = np.exp(generator.normal(0.0, 0.15 * strength))
     gain = np.exp(generator.normal(0.0, 0.15 * strength)) * np.exp(
         generator.normal(0.0, 0.04 * strength, 3)
@@ -101,9 +102,9 @@ def augmented(
     config: AugmentConfig,
     generator: np.random.Generator,
 ) -> tuple[Image, NDArray[np.float64]]:
-    """One changed copy of a model input (height, width, 3) and its exact pose (7,).
+    """Return one changed copy of a model input (height, width, 3) and its exact pose (7,).
 
-    Without a camera matrix only the light changes.
+    Without a camera matrix, only the light changes.
     """
     turned_pose = pose.copy()
     if K is not None and config.rotation_deg > 0:

@@ -1,9 +1,8 @@
-"""Images made worse on purpose, to see what intervals are worth when the camera sees less.
+"""Image degradations, to evaluate intervals on images worse than the calibration images.
 
-Each noise has one strength and 0 changes nothing. It falls on the camera's own image, before the
-model's resize: as on a device, averaging pixels then takes part of what differs from pixel to
-pixel. The paper (section V) adds gaussian, salt-and-pepper and speckle noise and states no
-strength.
+Each degradation has one strength; 0 leaves the image unchanged. It is applied to the camera image,
+before the model's resize, which averages out part of the pixel noise, as on a device. The paper
+(section V) adds gaussian, salt-and-pepper and speckle noise and does not state strengths.
 """
 
 from __future__ import annotations
@@ -26,23 +25,23 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Noise:
-    """One degradation of an image; its text is the one that ``parse_noise`` reads.
+    """One image degradation; ``str`` gives the text that ``parse_noise`` reads.
 
-    Raises UsageError for a name that is not in ``KINDS``, or a strength out of its range.
+    Raises UsageError for a name that is not in ``KINDS``, or a strength outside its range.
 
     Attributes
     ----------
     name
         A key of ``KINDS``.
     strength
-        In the unit that ``KINDS`` gives.
+        In the unit given in ``KINDS``.
     """
 
     name: str
     strength: float
 
     def __post_init__(self) -> None:
-        """Refuse what is not in ``KINDS``."""
+        """Raise UsageError for an unknown name or a strength outside its range."""
         if self.name not in KINDS:
             raise _unknown(self.name)
         kind = KINDS[self.name]
@@ -55,11 +54,11 @@ class Noise:
 
     @property
     def unit(self) -> str:
-        """What the strength is."""
+        """Unit of the strength."""
         return KINDS[self.name].unit
 
     def degrade(self, image: Image, generator: np.random.Generator) -> Image:
-        """Image (height, width, 3) uint8 BGR -> a new one of the same shape and type."""
+        """Return a degraded copy of an image, shape (height, width, 3), uint8, BGR."""
         return KINDS[self.name].degrade(image, self.strength, generator)
 
 
@@ -80,10 +79,10 @@ def parse_noise(text: str) -> Noise:
 
 
 def noisy(dataset: PoseDataset, noise: Noise, seed: int) -> PoseDataset:
-    """Return the same frames with every image degraded, each by a generator of (seed, frame).
+    """Return the data set with every image degraded, seeded by (seed, frame number).
 
-    What is drawn depends on no order. Names and poses stay, and with them splits and roles; the
-    data set's name, too, as it tells whose frames these are.
+    The result does not depend on the order of reading. Names and poses stay the same, so splits
+    and roles do too.
     """
 
     def read_image(index: int) -> Image:
@@ -96,7 +95,7 @@ def noisy(dataset: PoseDataset, noise: Noise, seed: int) -> PoseDataset:
 
 
 def _normal(image: Image, generator: np.random.Generator) -> NDArray[np.float32]:
-    """Draw standard normal numbers for every pixel and channel; a grey image has one channel."""
+    """Draw standard normal noise per pixel and channel; a grey image gets the same in all three."""
     if (image == image[..., :1]).all():
         grey = generator.standard_normal((*image.shape[:2], 1), dtype=np.float32)
         return np.repeat(grey, image.shape[2], axis=2)
@@ -104,15 +103,15 @@ def _normal(image: Image, generator: np.random.Generator) -> NDArray[np.float32]
 
 
 def _gaussian(image: Image, strength: float, generator: np.random.Generator) -> Image:
-    """Return I + 255 s n, n standard normal in every pixel and channel: noise of the sensor."""
+    """Return I + 255 s n, n standard normal per pixel and channel: sensor noise."""
     noise = _normal(image, generator)
-    # Both sums and products are rounded and cut at 0 and 255 by OpenCV.
+    # OpenCV rounds sums and products and clips them to 0..255.
     noisy = cv2.add(image, np.float32(255.0 * strength) * noise, dtype=cv2.CV_8U)
     return np.asarray(noisy, dtype=np.uint8)
 
 
 def _salt_and_pepper(image: Image, strength: float, generator: np.random.Generator) -> Image:
-    """Turn each pixel white with probability s/2, black with s/2: hot and dead pixels."""
+    """Turn each pixel white with probability s/2 and black with s/2: hot and dead pixels."""
     drawn = generator.random(image.shape[:2])
     noisy = image.copy()
     noisy[drawn < 0.5 * strength] = 0
@@ -121,31 +120,32 @@ def _salt_and_pepper(image: Image, strength: float, generator: np.random.Generat
 
 
 def _speckle(image: Image, strength: float, generator: np.random.Generator) -> Image:
-    """Return I (1 + s n), n standard normal in every pixel and channel: bright places suffer."""
+    """Return I (1 + s n), n standard normal per pixel and channel; affects bright pixels most."""
     noise = _normal(image, generator)
     noisy = cv2.multiply(image, 1.0 + np.float32(strength) * noise, dtype=cv2.CV_8U)
     return np.asarray(noisy, dtype=np.uint8)
 
 
 def _motion_blur(image: Image, strength: float, generator: np.random.Generator) -> Image:
-    """Mean along a straight path of s image widths in a random direction, centred on the pixel.
+    """Average along a straight path of s image widths in a random direction.
 
-    Centred, so that the pose stays that of the middle of the exposure.
+    The path is centred on the pixel, so that the pose is that of the middle of the exposure.
     """
     length = strength * image.shape[1]
     angle = generator.uniform(0.0, math.pi)
     shift = length * np.array([math.cos(angle), math.sin(angle)])
-    # Two samples a pixel: bilinear weights leave no ripple.
+    # With two samples per pixel, bilinear weights leave no ripple.
     kernel = streak(shift, 2 * math.ceil(length) + 1)
     blurred = cv2.filter2D(image, cv2.CV_8U, kernel, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(blurred, dtype=np.uint8)
 
 
 def _exposure(image: Image, strength: float, _: np.random.Generator) -> Image:
-    """Change light by the factor 2^s, cut at white: s stops, negative is darker.
+    """Change the exposure by s stops, a factor of 2^s clipped at white; negative is darker.
 
-    In linear light, as a shutter does it: coded values are decoded and coded by the curves of sRGB
-    (IEC 61966-2-1). What the camera had cut at white turns grey when it darkens. Nothing is drawn.
+    The factor applies in linear light, as with a shutter: values are decoded and encoded with the
+    sRGB curves (IEC 61966-2-1). Pixels that the camera clipped at white turn grey in a darker
+    image. Not random.
     """
     coded = np.arange(256) / 255.0
     light = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
@@ -155,7 +155,7 @@ def _exposure(image: Image, strength: float, _: np.random.Generator) -> Image:
 
 
 def _occlusion(image: Image, strength: float, generator: np.random.Generator) -> Image:
-    """Cover the share s by a rectangle of the image's shape: random place inside, random colour."""
+    """Cover a share s of the image by a rectangle of its shape, at random place and colour."""
     height, width = (round(math.sqrt(strength) * side) for side in image.shape[:2])
     top = generator.integers(image.shape[0] - height, endpoint=True)
     left = generator.integers(image.shape[1] - width, endpoint=True)
@@ -165,7 +165,7 @@ def _occlusion(image: Image, strength: float, generator: np.random.Generator) ->
 
 
 class Kind(NamedTuple):
-    """How an image is degraded; default and range of the strength, and what it is."""
+    """A kind of degradation, with the default, range and unit of its strength."""
 
     degrade: Callable[[Image, float, np.random.Generator], Image]
     default: float
@@ -174,8 +174,8 @@ class Kind(NamedTuple):
     unit: str
 
 
-# The first three defaults are those of MATLAB's imnoise, which has these names: variances 0.01 and
-# 0.05 (a deviation of 0.22), density 0.05. The others are as easy to see in a picture of a room.
+# The first three names and defaults follow MATLAB's imnoise: variances 0.01 and 0.05 (a standard
+# deviation of 0.22), density 0.05. The other defaults are about as visible in a picture of a room.
 KINDS: dict[str, Kind] = {
     "gaussian": Kind(_gaussian, 0.1, 0.0, 1.0, "deviation, share of the full range"),
     "salt-and-pepper": Kind(_salt_and_pepper, 0.05, 0.0, 1.0, "share of the pixels"),

@@ -1,9 +1,9 @@
-"""Which frame has which role. No frame ever has two.
+"""Split a data set into roles. A frame never has two roles.
 
 ``train`` fits the networks; ``fit`` is for models of residuals (CJP trains on train and fit
 together); ``val`` decides every choice (early stopping, score, scales); ``cal`` gives the
-thresholds and nothing else; ``test`` gives the final figures and nothing else. Where a finished
-network is only calibrated, on data that it has not seen, there are no frames to train on.
+thresholds and nothing else; ``test`` gives the final figures and nothing else. A split for
+calibrating an existing network on new data has no ``train`` and no ``fit``.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ SHARES: dict[Purpose, dict[str, float]] = {
 }
 
 _BLOCKS = 20
-# Frames dropped on the two sides of a border between blocks of different roles.
+# Frames dropped on either side of a border between blocks of different roles.
 _GAP_BEFORE, _GAP_AFTER = 7, 8
 _LEAST_SURVIVING = 0.6
-# Ten calibration sequences make the hierarchical rule finite at 0.9; one to spare.
+# The hierarchical rule needs ten calibration sequences to be finite at 0.9; this adds a spare one.
 _CALIBRATION_SEQUENCES, _MANY_SEQUENCES = 11, 30
 
 Indices = NDArray[np.int64]
@@ -43,7 +43,7 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Split:
-    """Frame numbers by role, ascending; frames of no role were dropped (gaps)."""
+    """Ascending frame numbers by role; frames in gaps between blocks have no role."""
 
     kind: SplitKind
     seed: int
@@ -51,9 +51,9 @@ class Split:
     roles: Mapping[str, Indices]
 
     def digest(self, dataset: PoseDataset) -> str:
-        """sha256 over the roles' frame names and poses: the same split of the same frames, or not.
+        """Return a sha256 over frame names and poses by role, which identifies the split.
 
-        Poses to a tenth of a millimetre and milliradian: how a reader rounds does not matter.
+        Poses are rounded to 1e-4 (m, quaternion), so that a reader's rounding does not matter.
         """
         digest = hashlib.sha256(json.dumps(self._names(dataset), sort_keys=True).encode())
         for role in sorted(self.roles):
@@ -61,7 +61,7 @@ class Split:
         return digest.hexdigest()
 
     def spec(self, dataset: PoseDataset) -> SplitSpec:
-        """Return what a bundle says of it."""
+        """Return the description of the split that a bundle stores."""
         return SplitSpec(
             purpose=self.purpose, kind=self.kind, seed=self.seed, sha256=self.digest(dataset)
         )
@@ -82,7 +82,7 @@ class Split:
 
 
 def read_split_spec(path: Path) -> SplitSpec:
-    """Read what ``Split.write`` wrote, without the frame names."""
+    """Read a file that ``Split.write`` wrote, without the frame names."""
     document = msgspec.json.decode(path.read_bytes())
     del document["roles"]
     return msgspec.convert(document, SplitSpec)
@@ -91,15 +91,15 @@ def read_split_spec(path: Path) -> SplitSpec:
 def make_split(
     dataset: PoseDataset, kind: SplitKind, seed: int, purpose: Purpose = "training"
 ) -> Split:
-    """Give every frame at most one role.
+    """Assign every frame at most one role.
 
-    ``random``: frames, exchangeable by construction but flattering on video; ``block``: 20
-    contiguous blocks with gaps where roles change; ``sequence``: whole sequences, the data set's
-    own test list respected. The same data set and arguments give the same split. For calibration
-    the frames of a data set's own test list are dealt, where it has one: those of its training list
-    are what networks are trained on.
+    ``random`` assigns single frames, which are exchangeable by construction but give optimistic
+    figures on video. ``block`` assigns 20 contiguous blocks and drops frames where roles change.
+    ``sequence`` assigns whole sequences and respects the data set's own test list. A calibration
+    split uses only the sequences on the data set's own test list, if it has one, because networks
+    are trained on the others. The same data set and arguments give the same split.
 
-    Raises UsageError where the data set is too small for the kind.
+    Raises UsageError if the data set is too small for the kind of split.
     """
     generator = np.random.default_rng(seed)
     frames = np.arange(len(dataset))
@@ -118,13 +118,13 @@ def make_split(
     if empty:
         raise UsageError(
             f"split {kind}: expected frames for every role, found none for {', '.join(empty)} "
-            f"among {frames.size} frames of {np.unique(dealt.sequence).size} sequence(s)"
+            f"among {frames.size} frames in {np.unique(dealt.sequence).size} sequence(s)"
         )
     return Split(kind, seed, purpose, roles)
 
 
 def default_kind(dataset: PoseDataset, purpose: Purpose = "training") -> SplitKind:
-    """Return ``sequence`` where there are enough sequences for the roles, else ``block``."""
+    """Return ``sequence`` if there are enough sequences for the roles, otherwise ``block``."""
     sequences = len(dataset.sequence_names)
     if purpose == "calibration" and dataset.own_test:
         sequences = len(dataset.own_test)
@@ -132,23 +132,24 @@ def default_kind(dataset: PoseDataset, purpose: Purpose = "training") -> SplitKi
 
 
 def same_split(dataset: PoseDataset, recorded: SplitSpec) -> Split:
-    """Make a recorded split again; raises SourceError where the data set is not the same."""
+    """Reproduce a recorded split; raises SourceError if the data set is not the same."""
     split = make_split(dataset, recorded.kind, recorded.seed, recorded.purpose)
     found = split.digest(dataset)
     if found != recorded.sha256:
         raise SourceError(
-            f"{dataset.name}: expected the frames of the recorded {recorded.kind} split "
-            f"{recorded.sha256[:12]}..., found {found[:12]}...; is it another data set? "
+            f"{dataset.name}: expected the data set of the recorded {recorded.kind} split "
+            f"(sha256 {recorded.sha256[:12]}...), found another data set ({found[:12]}...); "
             "--subset all needs no split"
         )
     return split
 
 
 def deal_folds(dataset: PoseDataset, split: Split, indices: Indices, count: int) -> list[Indices]:
-    """Positions within ``indices`` (frame numbers), dealt into folds by the unit of the split.
+    """Divide positions within ``indices`` (frame numbers) into folds, by the unit of the split.
 
-    Frames for a random split; for the others whole sequences or, where there are too few, runs of
-    frames that follow one another, as neighbouring frames would tell on each other.
+    The unit is a frame for a random split. Otherwise it is a sequence or, if there are too few
+    sequences, a run of consecutive frames, because neighbouring frames in different folds would
+    leak information.
     """
     unit = np.arange(indices.size)
     if split.kind != "random":
@@ -163,10 +164,10 @@ def deal_folds(dataset: PoseDataset, split: Split, indices: Indices, count: int)
 
 
 def training_frames(dataset: PoseDataset, split: Split, share: float) -> tuple[Indices, Indices]:
-    """Frame numbers of the roles train and fit, or of a share of each, drawn by the split's seed.
+    """Return the frame numbers of train and fit, or of a share of each.
 
-    Whole frames of a random split, sequences or runs of neighbours of the others; at least one of
-    each. A smaller share is a part of a larger one.
+    The split's seed draws single frames, whole sequences or runs of consecutive frames, according
+    to the kind of split; each role keeps at least one. A smaller share is a subset of a larger one.
     """
     if share == 1.0:
         return split.roles["train"], split.roles["fit"]
@@ -185,7 +186,7 @@ def training_frames(dataset: PoseDataset, split: Split, share: float) -> tuple[I
 
 
 def _counts(total: int, shares: Mapping[str, float]) -> dict[str, int]:
-    """Whole numbers that add up to ``total``, by largest remainder; none is 0 if that can be."""
+    """Divide ``total`` into whole numbers by largest remainder, each at least 1 if possible."""
     exact = {role: total * share / sum(shares.values()) for role, share in shares.items()}
     counts = {role: int(value) for role, value in exact.items()}
     by_remainder = sorted(exact, key=lambda role: counts[role] - exact[role])
@@ -199,7 +200,7 @@ def _counts(total: int, shares: Mapping[str, float]) -> dict[str, int]:
 
 
 def _part(dataset: PoseDataset, frames: Indices) -> PoseDataset:
-    """These frames of a data set, without lists of its own; frame numbers begin at 0 again."""
+    """Return a data set of these frames, numbered from 0, without its own train and test lists."""
     return replace(
         dataset,
         poses=dataset.poses[frames],
@@ -241,9 +242,9 @@ def _block(
     surviving = sum(part.size for parts in roles.values() for part in parts)
     if surviving < _LEAST_SURVIVING * len(dataset):
         raise UsageError(
-            f"split block: expected at least {_LEAST_SURVIVING:.0%} of the frames to survive the "
-            f"gaps, found {surviving} of {len(dataset)}; the recording is too short (--split "
-            "random deals single frames)"
+            f"split block: expected at least {_LEAST_SURVIVING:.0%} of the frames to remain after "
+            f"the gaps, found {surviving} of {len(dataset)}; the recording is too short; --split "
+            "random assigns single frames"
         )
     empty = np.empty(0, np.int64)
     return {role: np.concatenate(parts) if parts else empty for role, parts in roles.items()}
@@ -252,7 +253,7 @@ def _block(
 def _border(
     dataset: PoseDataset, blocks: list[Indices], role_of: Mapping[int, str], index: int
 ) -> bool:
-    """Whether blocks ``index`` and ``index + 1`` touch in time and have different roles."""
+    """Return whether blocks ``index`` and ``index + 1`` are adjacent and differ in role."""
     if not 0 <= index < len(blocks) - 1:
         return False
     same = dataset.sequence[blocks[index][0]] == dataset.sequence[blocks[index + 1][0]]
@@ -282,7 +283,7 @@ def _sequence(
 
 
 def _more_calibration(counts: Mapping[str, int]) -> dict[str, int]:
-    """Enough calibration sequences for the hierarchical rule, taken from fit and val in turn."""
+    """Move sequences from fit and val to cal, enough for the hierarchical rule."""
     changed = dict(counts)
     for _ in range(2 * _CALIBRATION_SEQUENCES):
         donor = max(("val", "fit"), key=lambda role: changed[role])

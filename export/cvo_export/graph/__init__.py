@@ -1,1 +1,1 @@
-"""The ONNX graph: export from torch, and 8-bit quantisation."""
+"""ONNX graphs: export from torch and 8-bit quantisation."""

@@ -1,9 +1,10 @@
-"""A float32 graph -> the same with an 8-bit backbone, by onnxruntime's static quantisation.
+"""Quantise the backbone of a float32 graph to 8 bits with onnxruntime's static quantisation.
 
-Weights are int8, a scale per output channel; feature maps are uint8, a scale each, from the ranges
-seen on training frames; both as pairs of QuantizeLinear and DequantizeLinear (QDQ), which every
-processor's kernels understand. The head stays in float32: it is a hundredth of the arithmetic, and
-its numbers are metres. What 8 bits cost is not hidden: thresholds come from the quantised graph.
+Weights are int8 with one scale per output channel; feature maps are uint8 with one scale each, from
+their ranges on training frames. Both use pairs of QuantizeLinear and DequantizeLinear (QDQ), which
+the kernels of every processor support. The head stays in float32: it takes a hundredth of the
+arithmetic, and its outputs are metres. Thresholds come from the quantised graph, so they include
+the quantisation error.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from cvo_edge.errors import UsageError
 
 Feed = Mapping[str, NDArray[np.generic]]
 
-# An activation behind a convolution becomes the range of its output, and costs nothing.
+# An activation after a convolution is folded into the range of its output, at no cost.
 _QUANTISED_KINDS = ("Conv", "Add", "MaxPool", "Relu", "Clip")
 
-# Of an int8 weight, symmetric about zero.
+# Largest int8 weight; symmetric about zero.
 _LARGEST_STEP = 127
 _LEAST_WEIGHT = 1e-8
 
@@ -41,10 +42,11 @@ _LEAST_WEIGHT = 1e-8
 def quantised(content: bytes, feeds: Sequence[Feed]) -> bytes:
     """Return the graph with its backbone in 8 bits.
 
-    The first convolution takes the image's own 8 bits, where the graph begins as our exporter
-    writes it, and stays in float32 elsewhere: normalised pixels are not to be rounded once more.
-    ``feeds`` are inputs by name, of frames that the ranges of the feature maps are taken from.
-    Raises UsageError for a backbone that has nothing to quantise.
+    If the graph begins as our exporter writes it, the first convolution reads the image's 8-bit
+    values directly. Otherwise it stays in float32, so that normalised pixels are not rounded again.
+    ``feeds`` are the inputs by name of the frames that give the ranges of the feature maps.
+
+    Raises UsageError if the backbone has no convolution, or one with computed weights.
     """
     model = onnx.shape_inference.infer_shapes(onnx.load_from_string(content))
     nodes = _backbone_nodes(model)
@@ -54,14 +56,15 @@ def quantised(content: bytes, feeds: Sequence[Feed]) -> bytes:
     if not convolutions or computed:
         raise UsageError(
             "precision int8: expected a backbone of convolutions with constant weights, found "
-            + (f"those of {computed[0]} computed" if computed else "none")
+            + (f"computed weights in {computed[0]}" if computed else "no convolution")
         )
     first = convolutions[0]
     zero = _fold_normalisation(model, first)
     chosen = [node for node in nodes if zero is not None or node is not first]
     _correct_biases(model, [node for node in chosen if node.op_type == "Conv"], feeds)
     kept = list(model.metadata_props)
-    # Else it asks on stderr for what the exporter has done: folded normalisations, known shapes.
+    # Without this mark onnxruntime warns on stderr that the model was not pre-processed, although
+    # the exporter has already folded normalisations and inferred shapes.
     add_pre_process_metadata(model)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "model.onnx"
@@ -87,11 +90,11 @@ def quantised(content: bytes, feeds: Sequence[Feed]) -> bytes:
 
 
 def _fold_normalisation(model: ModelProto, first: NodeProto) -> int | None:
-    """Put pixel scaling into the first convolution; returns the pixel that is its zero, or None.
+    """Fold the pixel normalisation into the first convolution and return its zero pixel.
 
-    Of (x - mean) / std a convolution takes W / std of x - zero instead, and the rest goes into its
-    bias: (W / std) (zero - mean). Where it pads, the border is of that pixel instead of the mean.
-    None, and nothing is changed, where the graph does not begin so.
+    Instead of (x - mean) / std with weights W, the convolution reads x - zero with weights W / std,
+    and its bias gains (W / std) (zero - mean). Padding then has the value of the zero pixel instead
+    of the mean. Returns None and changes nothing if the graph does not begin with a normalisation.
     """
     graph = model.graph
     constants = {constant.name: constant for constant in graph.initializer}
@@ -127,7 +130,7 @@ def _fold_normalisation(model: ModelProto, first: NodeProto) -> int | None:
 
 
 def _take_pixels(model: ModelProto, name: str, zero: int) -> None:
-    """Let who reads the quantised x - zero read the image's 8 bits, which are the same numbers."""
+    """Replace the quantised x - zero by the image's 8-bit values, which are the same numbers."""
     graph = model.graph
     made = {output: node for node in graph.node for output in node.output}
     subtract = made[name]
@@ -144,7 +147,7 @@ def _take_pixels(model: ModelProto, name: str, zero: int) -> None:
 
 
 def _drop_unused(model: ModelProto) -> None:
-    """Remove constants that no node reads any more."""
+    """Remove constants that no node reads."""
     graph = model.graph
     used = {name for node in graph.node for name in node.input}
     kept = [constant for constant in graph.initializer if constant.name in used]
@@ -155,11 +158,11 @@ def _drop_unused(model: ModelProto) -> None:
 def _correct_biases(
     model: ModelProto, convolutions: list[NodeProto], feeds: Sequence[Feed]
 ) -> None:
-    """Put into each bias what rounded weights change of the mean output, b + (W - W') E[x].
+    """Correct each bias for the mean error of the rounded weights: b + (W - W') E[x].
 
-    Nagel et al. 2019 (data-free quantisation), section 4.2, with means seen instead of assumed.
-    Feature maps behind a rectifier are far from zero on average, so that the error of a weight is
-    first of all a shift: half of all that 8 bits cost.
+    Nagel et al. 2019 (data-free quantisation), section 4.2, with measured instead of assumed means.
+    The mean of a feature map after a rectifier is far from zero, so weight errors mainly shift the
+    output; this shift is half of the total error of quantisation.
     """
     constants = {constant.name: constant for constant in model.graph.initializer}
     means = _mean_channels(model, [node.input[0] for node in convolutions], feeds)
@@ -168,12 +171,12 @@ def _correct_biases(
         largest = np.abs(weight).max(axis=(1, 2, 3), keepdims=True)
         step = np.maximum(largest, _LEAST_WEIGHT) / _LARGEST_STEP
         lost = (weight - step * np.round(weight / step)).sum(axis=(2, 3))
-        # Of a grouped convolution each output sees the inputs of its group.
+        # In a grouped convolution, each output depends only on the inputs of its group.
         group = next((a.i for a in node.attribute if a.name == "group"), 1)
         inputs = means[node.input[0]].reshape(group, -1).repeat(len(weight) // group, axis=0)
         shift = (lost * inputs).sum(axis=1)
         if len(node.input) == 2:
-            # An exporter leaves out a bias of zeros.
+            # Exporters omit a bias of zeros.
             node.input.append("")
         else:
             shift += numpy_helper.to_array(constants[node.input[2]])
@@ -186,7 +189,7 @@ def _correct_biases(
 def _mean_channels(
     model: ModelProto, names: Sequence[str], feeds: Sequence[Feed]
 ) -> dict[str, NDArray[np.float64]]:
-    """Mean of every channel of these feature maps over frames and pixels, (channels,) each."""
+    """Return each feature map's channel means over frames and pixels, (channels,) each."""
     shown = ModelProto()
     shown.CopyFrom(model)
     wanted = list(dict.fromkeys(names))
@@ -202,18 +205,18 @@ def _mean_channels(
 
 
 class _Feeds(CalibrationDataReader):  # type: ignore[misc]
-    """Feeds one after the other, as onnxruntime asks for them."""
+    """Adapts feeds to onnxruntime's calibration interface."""
 
     def __init__(self, feeds: Sequence[Feed]) -> None:
         self._feeds: Iterator[Feed] = iter(feeds)
 
     def get_next(self) -> Feed | None:
-        """Return the next feed, None behind the last."""
+        """Return the next feed, or None after the last."""
         return next(self._feeds, None)
 
 
 def _backbone_nodes(model: ModelProto) -> list[NodeProto]:
-    """Nodes that work on feature maps: those of four dimensions, of the kinds above."""
+    """Return the nodes to quantise: the kinds above whose output has four dimensions."""
     rank = {value.name: len(value.type.tensor_type.shape.dim) for value in model.graph.value_info}
     return [
         node

@@ -1,4 +1,4 @@
-"""torch -> one ONNX graph, names and opset fixed, and proof that both compute the same."""
+"""Export torch modules to ONNX with fixed names and opset, and check that both agree."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cvo_edge.errors import GateError
 OPSET = 18
 
 # Largest difference between torch and onnxruntime in float32, in metres, radians or quaternion
-# units; both round in another order.
+# units. They round differently because they compute in a different order.
 PARITY_TOLERANCE = 1e-4
 
 
@@ -29,9 +29,9 @@ def export_onnx(
     input_names: Sequence[str],
     output_names: Sequence[str],
 ) -> bytes:
-    """Export a module for inputs of exactly these shapes -> the bytes of one ONNX file."""
+    """Export a module for inputs of exactly these shapes; returns the content of an ONNX file."""
     module.eval()
-    # The exporter reports its steps on stdout and through a logger; stdout belongs to our data.
+    # The exporter reports its progress on stdout, which is reserved for our data, and to a logger.
     exporter_log = logging.getLogger("torch.onnx")
     level = exporter_log.level
     exporter_log.setLevel(logging.ERROR)
@@ -54,9 +54,9 @@ def export_onnx(
     finally:
         exporter_log.setLevel(level)
     if program is None:
-        raise GateError("export: expected a graph from torch.onnx, found none")
+        raise GateError("export: expected a graph from torch.onnx, but it returned nothing")
     proto = program.model_proto
-    # Names of source files and lines of this machine are of no use on a board.
+    # Source file names and line numbers of this machine are useless on a board.
     for node in proto.graph.node:
         del node.metadata_props[:]
         node.doc_string = ""
@@ -73,9 +73,9 @@ def check_parity(
     feeds: Iterable[dict[str, NDArray[np.generic]]],
     input_names: Sequence[str],
 ) -> float:
-    """Largest absolute difference of any output between torch and the exported graph.
+    """Return the largest absolute difference of any output between torch and the exported graph.
 
-    Raises GateError where it exceeds ``PARITY_TOLERANCE`` or is NaN.
+    Raises GateError if it exceeds ``PARITY_TOLERANCE`` or is NaN.
     """
     names = [spec.name for spec in session.outputs]
     worst = 0.0

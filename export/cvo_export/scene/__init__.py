@@ -1,7 +1,7 @@
 """A virtual room and a camera in it.
 
-renderer    textured rectangles -> image, exact for any pose; knows nothing of the room
+renderer    renders textured rectangles exactly, from any pose; independent of the room
 paint       the room's textures
-room        its walls and furniture, as faces for the renderer
-sensor      what a real camera adds to a rendering: motion blur, light and noise
+room        walls and furniture as faces for the renderer
+sensor      motion blur, light and noise of a real camera
 """

@@ -1,4 +1,4 @@
-"""Textures, painted from a generator: what a material or an object looks like from the front."""
+"""Procedural textures of materials and objects, from a random generator."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from cvo_export.scene.renderer import Image, as_image
 Colour = tuple[int, int, int]  # BGR
 Paint = Callable[[np.random.Generator, int, int, Colour], Image]  # height and width in texels
 
-WALL_TEXELS_M = 240  # what hangs on a wall has a size in metres
+WALL_TEXELS_M = 240  # fixed, because pictures on a wall have a size in metres
 
 
 def noise(rng: np.random.Generator, height: int, width: int, cell: float) -> NDArray[np.float32]:
-    """Return multi-scale noise of about unit variance; its largest features measure ``cell``."""
+    """Return multi-scale noise of about unit variance; ``cell`` is the coarsest feature size."""
     total = np.zeros((height, width), np.float32)
     weight = 0.8
     while cell >= 2:
@@ -31,7 +31,7 @@ def noise(rng: np.random.Generator, height: int, width: int, cell: float) -> NDA
 
 
 def plain(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Paint with soft stains, a gradient and a fine grain."""
+    """Paint a surface with soft stains and a gradient."""
     paint = np.full((height, width, 3), colour, np.float32)
     cell = max(height, width) / 3
     paint *= 1 + 0.1 * noise(rng, height, width, cell)[..., None]
@@ -41,21 +41,21 @@ def plain(rng: np.random.Generator, height: int, width: int, colour: Colour) -> 
 
 
 def _vary(rng: np.random.Generator, colour: Sequence[float], spread: float) -> Colour:
-    """Return a colour near another one: lighter or darker, and somewhat of another hue."""
+    """Return a random colour near another one, with a different brightness and hue."""
     near = np.array(colour) * rng.normal(1, spread) + rng.normal(0, 60 * spread, 3)
     b, g, r = near.clip(8, 247).astype(int).tolist()
     return b, g, r
 
 
 def _vivid(rng: np.random.Generator) -> Colour:
-    """Return a colour of any hue, neither pale nor dark."""
+    """Return a random saturated colour of any hue."""
     hsv = np.array([[[rng.integers(180), rng.integers(110, 220), rng.integers(90, 240)]]], np.uint8)
     b, g, r = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].tolist()
     return b, g, r
 
 
 def planks(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Lay wooden boards of their own colour, grain and length along the longer side."""
+    """Paint wooden boards along the longer side, with varying colour, grain and length."""
     if height > width:
         return np.ascontiguousarray(planks(rng, width, height, colour).transpose(1, 0, 2))
     boards = max(round(height / 36), 1)
@@ -74,7 +74,7 @@ def planks(rng: np.random.Generator, height: int, width: int, colour: Colour) ->
 
 
 def tiles(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Lay square tiles, some of them with a motif."""
+    """Paint square tiles, some with a motif."""
     image = plain(rng, height, width, (190, 195, 200))
     for top in range(0, height, 48):
         for left in range(0, width, 48):
@@ -103,7 +103,7 @@ def panels(rng: np.random.Generator, height: int, width: int, colour: Colour) ->
 
 
 def books(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Fill shelves with books of all sizes and colours."""
+    """Paint shelves filled with books of various sizes and colours."""
     image = plain(rng, height, width, colour)
     shelves = max(round(height / 100), 1)
     bottoms = (np.arange(1, shelves + 1) * height // shelves - 8).tolist()
@@ -122,7 +122,7 @@ def books(rng: np.random.Generator, height: int, width: int, colour: Colour) -> 
 
 
 def crate(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Nail a crate together and stencil it."""
+    """Paint a wooden crate with a stencilled word."""
     image = planks(rng, height, width, colour)
     beam = _vary(rng, [0.75 * value for value in colour], 0.1)
     cv2.line(image, (0, height), (width, 0), beam, 24, cv2.LINE_AA)
@@ -135,7 +135,7 @@ def crate(rng: np.random.Generator, height: int, width: int, colour: Colour) -> 
 
 
 def _write(rng: np.random.Generator, image: Image, colour: Colour, at: float) -> None:
-    """Write an invented word across the image, at a height given as a share of the image's."""
+    """Write an invented word across the image; ``at`` is the height as a share of the image's."""
     height, width = image.shape[:2]
     syllables = rng.integers((14, 5), size=(2, 2)).tolist()
     word = "".join("BDFGKLMNPRSTVZ"[first] + "AEIOU"[second] for first, second in syllables)
@@ -147,7 +147,7 @@ def _write(rng: np.random.Generator, image: Image, colour: Colour, at: float) ->
 
 
 def poster(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Print an abstract poster: a gradient, shapes and a word."""
+    """Paint an abstract poster: a gradient, shapes and a word."""
     ramp = np.linspace(0.7, 1.25, height, dtype=np.float32)[:, None, None]
     image = as_image(plain(rng, height, width, colour) * ramp)
     for _ in range(9):
@@ -167,7 +167,7 @@ def poster(rng: np.random.Generator, height: int, width: int, colour: Colour) ->
 
 
 def landscape(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Paint a landscape: sky, clouds, three ranges of hills."""
+    """Paint a landscape: sky, clouds and three ranges of hills."""
     sky = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
     image = np.array(colour, np.float32) * (1 - sky) + np.array([225, 235, 240], np.float32) * sky
     clouds = noise(rng, height, width, width / 2.5).clip(0, 1.5)[..., None]
@@ -181,14 +181,14 @@ def landscape(rng: np.random.Generator, height: int, width: int, colour: Colour)
 
 
 def screen(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Show a picture in a dark bezel."""
+    """Paint a screen: a landscape in a dark bezel."""
     image = landscape(rng, height, width, colour)
     cv2.rectangle(image, (0, 0), (width, height), (28, 26, 26), 24)
     return image
 
 
 def fabric(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Weave cloth with stripes of different width and a few patches."""
+    """Paint cloth with stripes of different widths and a few patches."""
     image = plain(rng, height, width, colour)
     left = 0
     while left < width:
@@ -214,7 +214,7 @@ def leaves(rng: np.random.Generator, height: int, width: int, colour: Colour) ->
 
 
 def _hang(image: Image, art: Image, left_m: float, top_m: float, frame: Colour) -> None:
-    """Put a framed picture on a wall, metres from its upper left corner; it casts a shadow."""
+    """Add a framed picture with a shadow to a wall, offset from the upper left corner in metres."""
     x, y = round(left_m * WALL_TEXELS_M), round(top_m * WALL_TEXELS_M)
     height, width = art.shape[:2]
     shade = image[y - 4 : y + height + 16, x - 4 : x + width + 14]
@@ -224,7 +224,7 @@ def _hang(image: Image, art: Image, left_m: float, top_m: float, frame: Colour) 
 
 
 def front_wall(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
-    """Paper the wall one looks at: stripes, a wainscot, a window and pictures."""
+    """Paint the wall in front of the camera: striped wallpaper, wainscot, window and pictures."""
     image = plain(rng, height, width, colour)
     left = 0
     while left < width:

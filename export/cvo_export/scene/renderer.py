@@ -1,11 +1,11 @@
-"""Textured rectangles, rendered from any pose.
+"""Render textured rectangles from any pose.
 
-Camera frame: OpenCV's (x right, y down, z forward). A world point ``X`` appears at pixel ``p`` with
-``z (p_x, p_y, 1) = K R^T (X - t)``, where ``R`` and ``t`` belong to ``T_world_camera`` and pixel
-centres have integer coordinates: the top left pixel covers [-0.5, 0.5] x [-0.5, 0.5].
+The camera frame is OpenCV's (x right, y down, z forward). A world point ``X`` appears at pixel
+``p`` with ``z (p_x, p_y, 1) = K R^T (X - t)``, where ``R`` and ``t`` belong to ``T_world_camera``.
+Pixel centres have integer coordinates: the top left pixel covers [-0.5, 0.5] x [-0.5, 0.5].
 
-Images are reproducible bit by bit on one machine with one version of numpy and OpenCV; other
-versions may round differently.
+Images are bit-identical on one machine with the same versions of numpy and OpenCV; other versions
+may round differently.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Pinhole = tuple[float, float, float, float]  # fx fy cx cy in pixels
 _OVERSAMPLING = 2
 _NEAR_M = 0.05
 _EDGE_ON_M = 1e-6
-_TILE_M = 1.3  # large faces choose their texture level tile by tile
+_TILE_M = 1.3  # large faces are divided into tiles, each with its own texture level
 
 
 def as_image(values: NDArray[Any]) -> Image:
@@ -44,7 +44,7 @@ class Face(NamedTuple):
         Shape (3,), metres: the outer corner of the texture's first texel.
     edge_u, edge_v
         Shape (3,), metres: along the texture's width and height. ``edge_u x edge_v`` points away
-        from whoever sees the face.
+        from the visible side.
     texture
         Shape (rows, columns, 3), uint8, BGR.
     """
@@ -59,7 +59,7 @@ class Scene:
     """Textured rectangles that can be rendered from any pose.
 
     Visibility is exact: inverse depth is linear in the image of a plane, and every sample keeps the
-    nearest face. Each pixel averages 2 x 2 samples of a texture level that suits the distance.
+    nearest face. Each pixel averages 2 x 2 samples, from a texture level chosen by distance.
     """
 
     def __init__(self, faces: Iterable[Face]) -> None:
@@ -78,24 +78,24 @@ class Scene:
                 quads.append(corner + uv / tiles @ edges)
                 owners.append(number)
         self._owner = np.array(owners)
-        self._quads = np.array(quads)  # (tiles, 5, 3): closed, clockwise for whoever sees them
+        self._quads = np.array(quads)  # (tiles, 5, 3): closed, clockwise from the visible side
 
     def render(self, pose: Floats, intrinsics: Pinhole, size: tuple[int, int]) -> Image:
-        """Render the scene without blur, light falloff or noise.
+        """Render the scene without motion blur, vignetting or noise.
 
         Parameters
         ----------
         pose
             Shape (7,): ``T_world_camera`` as tx ty tz in metres and qx qy qz qw.
         intrinsics
-            fx, fy, cx, cy in pixels of the image asked for.
+            fx, fy, cx, cy in pixels of the rendered image.
         size
             Width and height in pixels.
 
         Returns
         -------
         Image
-            Shape (height, width, 3), uint8, BGR; black where there is no face.
+            Shape (height, width, 3), uint8, BGR; black outside all faces.
         """
         width, height = size[0] * _OVERSAMPLING, size[1] * _OVERSAMPLING
         first = (_OVERSAMPLING - 1) / 2  # sample coordinate of the centre of pixel 0
@@ -105,16 +105,16 @@ class Scene:
         quads = (self._quads - pose[:3]) @ project.T  # homogeneous sample coordinates (x z, y z, z)
         x, y, z = quads[..., 0], quads[..., 1], quads[..., 2]
         inside = [x + z, width * z - x, y + z, height * z - y, z - _NEAR_M]
-        # A camera in a face's plane sees nothing of it, and the face could not be unprojected.
+        # A face seen edge-on is invisible, and its unprojection would be singular.
         ahead = np.einsum("ij,ij->i", self._corner - pose[:3], self._away)
         seen = ahead[self._owner] > _EDGE_ON_M
         for halfspace in inside:
             seen &= (halfspace > 0).any(axis=1)
-        # Near tiles first: what they hide altogether is never sampled.
+        # Draw near tiles first, so that completely hidden tiles are never sampled.
         tiles = np.flatnonzero(seen)
         tiles = tiles[np.argsort(z[tiles].mean(axis=1), kind="stable")]
         owners = self._owner[tiles]
-        # Per tile: maps (x, y, 1) of a sample to (u, v, 1) / z, with u and v in [0, 1] on the face.
+        # Per tile, map a sample's (x, y, 1) to (u, v, 1) / z, with u and v in [0, 1] on the face.
         frames = np.stack([*self._edges.transpose(1, 0, 2), self._corner - pose[:3]], axis=2)
         unproject = np.linalg.inv((project @ frames)[owners])
 
@@ -133,7 +133,7 @@ class Scene:
         unproject: Floats,
         levels: Sequence[Image],
     ) -> None:
-        """Draw a closed convex polygon (n, 2), in samples, where it is nearest so far."""
+        """Draw a closed convex polygon (n, 2), in samples, where it is the nearest so far."""
         height, width = nearness.shape
         left, top = np.ceil(polygon.min(axis=0)).clip(0).astype(int)
         right, bottom = np.minimum(np.ceil(polygon.max(axis=0)), (width, height)).astype(int)
@@ -167,10 +167,10 @@ class Scene:
 
 def _pyramid(texture: Image) -> list[Image]:
     """Return the texture at 1, 1/sqrt(2), 1/2, ... of its size, down to a few texels, BGRA."""
-    # The unused fourth channel more than halves the time OpenCV takes to sample.
+    # With an unused fourth channel, OpenCV samples more than twice as fast.
     levels = [np.asarray(cv2.cvtColor(texture, cv2.COLOR_BGR2BGRA), np.uint8)]
     while min(levels[-1].shape[:2]) > 8:
-        # Halving the level before the last keeps every second level free of resampling error.
+        # Halve the level before the last, so that sizes halve exactly and errors do not add up.
         shape = np.array(texture.shape[:2]) * 0.5 ** (len(levels) / 2)
         rows, columns = np.rint(shape).astype(int)
         source = levels[max(len(levels) - 2, 0)]
@@ -187,19 +187,19 @@ def _level_for(sample: Floats, unproject: Floats, levels: Sequence[Image]) -> Im
     u, v = u / inverse_depth, v / inverse_depth
     u_x, u_y = columns * (u_x - u * d_x), columns * (u_y - u * d_y)
     v_x, v_y = rows * (v_x - v * d_x), rows * (v_y - v * d_y)
-    # The singular values of ((u_x, u_y), (v_x, v_y)) are the texels a sample spans along its long
-    # and its short axis.
+    # The singular values of ((u_x, u_y), (v_x, v_y)) are the texels that a sample spans along its
+    # long and its short axis.
     area = abs(u_x * v_y - u_y * v_x)
     norm = u_x**2 + u_y**2 + v_x**2 + v_y**2
     long = math.sqrt((norm + math.sqrt(max(norm**2 - 4 * area**2, 0))) / 2)
-    # Between blur along the short axis and aliasing along the long one.
+    # Compromise between blur along the short axis and aliasing along the long axis.
     span = max(math.sqrt(area), long / 1.6, 1e-9)
     level = round(2 * math.log2(span))
     return levels[min(max(level, 0), len(levels) - 1)]
 
 
 def _in_front(loop: Floats) -> Floats:
-    """Project a closed loop of homogeneous points (n, 3) to (n, 2), cut at the near plane."""
+    """Project a closed loop of homogeneous points (n, 3) to (n, 2), clipped at the near plane."""
     depth = loop[:, 2] - _NEAR_M
     if depth.min() < 0:
         kept: list[Floats] = []
@@ -213,7 +213,7 @@ def _in_front(loop: Floats) -> Floats:
 
 
 def _spans(polygon: Floats, rows: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Return where a closed clockwise polygon begins and ends in each row, shape (rows,) each."""
+    """Return the start and end of a closed clockwise polygon in each row, shape (rows,) each."""
     step = polygon[1:] - polygon[:-1]
     sloped = step[:, 1] != 0
     start, step = polygon[:-1][sloped], step[sloped]

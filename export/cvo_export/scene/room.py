@@ -1,6 +1,6 @@
-"""The room: 5 x 4 x 2.6 m, always the same; richest where the flights look, towards +y.
+"""The room: 5 x 4 x 2.6 m, fixed, with most detail in the viewing direction of the flights (+y).
 
-World frame: x right, y forward, z up, in metres; the origin lies on the floor in the middle.
+World frame: x right, y forward, z up, in metres; the origin is the centre of the floor.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ROOM_M = np.array([5.0, 4.0, 2.6])
 _BOX_TEXELS_M = 300
 _LIGHT_TEXELS_M = 40
 
-# The six viewing directions: the texture's u and v axes as seen along them (u x v = direction).
+# Texture axes u and v for each of the six viewing directions (u x v = direction).
 _VIEWS = {
     "+y": ((1, 0, 0), (0, 0, -1)),
     "-y": ((-1, 0, 0), (0, 0, -1)),
@@ -30,31 +30,31 @@ _VIEWS = {
     "-z": ((1, 0, 0), (0, -1, 0)),
     "+z": ((1, 0, 0), (0, 1, 0)),
 }
-# Light on a surface, by the direction one looks along to see it.
+# Light on a surface, by the viewing direction from which it is seen.
 _LIGHT = {"+y": 0.97, "-y": 0.8, "+x": 0.8, "-x": 0.9, "-z": 1.06, "+z": 0.6}
 
 _Sides = dict[str, tuple[Floats, Floats, Floats]]  # view -> corner, edge_u and edge_v of a face
 
 
 class _Box(NamedTuple):
-    """A piece of furniture: the middle of its base and its size in metres, its yaw in degrees."""
+    """A piece of furniture: centre of its base and size in metres, yaw in degrees."""
 
     base: tuple[float, float, float]
     size: tuple[float, float, float]
     yaw: float
-    paint: Paint  # on its large upright sides
-    trim: Paint  # on all the others
+    paint: Paint  # on large vertical sides
+    trim: Paint  # on all other sides
     colour: Colour
 
     def sides(self) -> _Sides:
-        """Return its sides, seen from outside."""
+        """Return the sides, seen from outside."""
         centre = np.add(self.base, (0, 0, self.size[2] / 2))
         return _cuboid(centre, np.array(self.size), math.radians(self.yaw), inside=False)
 
 
 @functools.cache
 def room() -> Scene:
-    """Return the room: walls, floor, ceiling and furniture; its textures are painted once."""
+    """Return the room with walls, floor, ceiling and furniture; textures are painted only once."""
     boxes = [_box(np.random.default_rng((2, n)), row) for n, row in enumerate(_FURNITURE)]
     return Scene([*_shell(), *(face for box in boxes for face in box)])
 
@@ -92,7 +92,7 @@ def _box(rng: np.random.Generator, row: _Box) -> list[Face]:
 
 
 def _shell() -> list[Face]:
-    """Build walls, floor and ceiling, shaded in the corners and where furniture stands close."""
+    """Build walls, floor and ceiling, shaded in corners and near furniture."""
     faces = []
     sides = _cuboid(np.array([0, 0, ROOM_M[2] / 2]), ROOM_M, 0, inside=True)
     for number, (view, (corner, u, v)) in enumerate(sides.items()):
@@ -110,7 +110,7 @@ def _shell() -> list[Face]:
 
 
 def _contact_light(corner: Floats, edge_u: Floats, edge_v: Floats) -> NDArray[np.float32]:
-    """Return how bright a side of the room is: dark corners and shadows of what stands close."""
+    """Return the brightness of a side of the room: dark corners, and shadows of near furniture."""
     spans = np.array([np.linalg.norm(edge_u), np.linalg.norm(edge_v)])
     width, height = np.rint(spans * _LIGHT_TEXELS_M).astype(int).tolist()
     axes = np.array([edge_u / spans[0], edge_v / spans[1]])
@@ -148,7 +148,7 @@ _SURFACES: dict[str, tuple[Paint, Colour]] = {
 _WOOD = (60, 110, 170)
 
 _FURNITURE = (
-    # A table with things on it.
+    # A table with objects on it.
     _Box((0.1, 1.05, 0.71), (1.2, 0.6, 0.05), 0, paint.planks, paint.planks, (80, 140, 200)),
     _Box((-0.44, 0.81, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
     _Box((0.64, 0.81, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
@@ -160,19 +160,19 @@ _FURNITURE = (
     _Box((0.08, 0.95, 0.76), (0.09, 0.09, 0.11), 33, paint.plain, paint.plain, (70, 200, 235)),
     _Box((0.1, 1.2, 0.76), (0.13, 0.13, 0.1), 15, paint.tiles, paint.plain, (70, 90, 170)),
     _Box((0.1, 1.2, 0.86), (0.2, 0.2, 0.24), 40, paint.leaves, paint.leaves, (60, 140, 70)),
-    # Along the wall in front: a low cabinet with a screen, shelves above.
+    # Along the front wall: a low cabinet with a screen, and shelves above it.
     _Box((-0.05, 1.82, 0), (1.7, 0.34, 0.5), 0, paint.panels, paint.planks, (120, 90, 60)),
     _Box((-0.2, 1.88, 0.5), (0.95, 0.06, 0.64), 0, paint.screen, paint.plain, (220, 120, 120)),
     _Box((1.15, 1.88, 1.42), (0.8, 0.24, 0.04), 0, paint.planks, paint.planks, _WOOD),
     _Box((1.0, 1.89, 1.46), (0.42, 0.18, 0.26), 0, paint.books, paint.plain, _WOOD),
     _Box((1.38, 1.88, 1.46), (0.16, 0.16, 0.22), 28, paint.leaves, paint.leaves, (80, 170, 120)),
     _Box((1.1, 1.7, 0), (0.36, 0.36, 0.42), 18, paint.fabric, paint.fabric, (60, 160, 220)),
-    # Corners: a cupboard with a case on top, a white one with a box on top.
+    # In the corners: a cupboard with a crate on top, and a white cupboard with a box on top.
     _Box((-1.98, 1.7, 0), (0.85, 0.56, 1.9), 0, paint.panels, paint.plain, (150, 170, 120)),
     _Box((-2.0, 1.66, 1.9), (0.55, 0.4, 0.24), 8, paint.crate, paint.plain, (60, 80, 150)),
     _Box((2.08, 1.62, 0), (0.66, 0.66, 1.65), 0, paint.panels, paint.plain, (215, 220, 222)),
     _Box((2.08, 1.62, 1.65), (0.4, 0.3, 0.28), -20, paint.poster, paint.plain, (60, 130, 220)),
-    # To the left: a column, a floor lamp.
+    # On the left: a column and a floor lamp.
     _Box((-1.5, 0.85, 0), (0.24, 0.24, 2.6), 0, paint.tiles, paint.plain, (90, 120, 210)),
     _Box((-1.1, 1.5, 0), (0.04, 0.04, 1.4), 0, paint.plain, paint.plain, (45, 42, 40)),
     _Box((-1.1, 1.5, 1.4), (0.34, 0.34, 0.32), 22, paint.fabric, paint.plain, (150, 215, 245)),

@@ -1,6 +1,6 @@
-"""What a camera adds to a rendering: motion blur, the light of the moment, noise.
+"""Camera effects on a rendering: motion blur, lighting and noise.
 
-Between these steps an image has the shape (height, width, 3), float32, in grey levels, BGR.
+Between these steps, images are float32 grey levels of shape (height, width, 3), BGR.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from cvo_export.scene.renderer import Floats, Image, Pinhole
 
 Levels = NDArray[np.float32]
 
-_BLUR_DEPTH_M = 2.2  # the typical distance of what the camera sees
+_BLUR_DEPTH_M = 2.2  # typical distance from the camera to the scene
 _BLUR_SAMPLES = 16
 
 
 def motion_blur(
     sharp: Image, opening: Floats, pose: Floats, closing: Floats, intrinsics: Pinhole
 ) -> Levels:
-    """Smear a rendering along the path of its centre while the shutter was open.
+    """Blur a rendering along the path of the image centre while the shutter is open.
 
     Parameters
     ----------
     sharp
         Shape (height, width, 3), uint8: rendered from ``pose``.
     opening, pose, closing
-        Shape (7,) each, ``T_world_camera``: where the shutter opens, half way, and where it closes.
+        Shape (7,) each, ``T_world_camera`` when the shutter opens, halfway, and when it closes.
     intrinsics
         fx, fy, cx, cy in pixels.
     """
@@ -40,7 +40,7 @@ def motion_blur(
 
 
 def _image_shift(opening: Floats, pose: Floats, closing: Floats, intrinsics: Pinhole) -> Floats:
-    """Return how far the image centre moves while the shutter is open, shape (2,), pixels."""
+    """Return the motion of the image centre while the shutter is open, shape (2,), pixels."""
     seen = pose[:3] + _BLUR_DEPTH_M * quaternion_to_matrix(pose[3:])[:, 2]
     ends = [(seen - end[:3]) @ quaternion_to_matrix(end[3:]) for end in (opening, closing)]
     moved = ends[1][:2] / ends[1][2] - ends[0][:2] / ends[0][2]
@@ -48,10 +48,10 @@ def _image_shift(opening: Floats, pose: Floats, closing: Floats, intrinsics: Pin
 
 
 def streak(shift: Floats, samples: int) -> Levels:
-    """Return the kernel of a uniform motion by ``shift`` pixels, symmetric and of sum one.
+    """Return the blur kernel of a uniform motion by ``shift`` pixels; symmetric, with sum 1.
 
-    ``shift`` (2,) is right and down, in pixels; ``samples`` points of the path share its light, at
-    least one for each pixel, or the streak has gaps.
+    ``shift`` (2,) is right and down, in pixels. ``samples`` is the number of points along the path;
+    with fewer than one per pixel, the streak has gaps.
     """
     radius = math.ceil(float(np.abs(shift).max()) / 2)
     kernel = np.zeros((2 * radius + 3, 2 * radius + 3), np.float32)
@@ -63,7 +63,7 @@ def streak(shift: Floats, samples: int) -> Levels:
 
 
 class Light:
-    """Brightness, tint and vignetting of one recording, and a slow drift of its exposure."""
+    """Brightness, tint, vignetting and slow exposure drift of one recording."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         warmth = rng.normal(0, 0.06)
