@@ -1,4 +1,4 @@
-"""Training side of cvo-edge: data sets, networks, export to ONNX, calibration, evaluation."""
+"""Training side of cvo-edge: data sets, networks, ONNX export, calibration and evaluation."""
 
 from __future__ import annotations
 

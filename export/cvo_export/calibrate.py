@@ -1,8 +1,8 @@
-"""A network that is already there -> a bundle: any ONNX model of the right form, or a bundle.
+"""Calibrate an existing network: an ONNX model with suitable outputs, or the model of a bundle.
 
-Needs no torch. A model with the output ``pose`` alone gets the residual score; one with ``lower``
-and ``upper`` besides the scores of conformalized quantile regression. A bundle keeps its method and
-gets thresholds of other data: a new site, another camera, another light.
+Does not need torch. A model whose only output is ``pose`` gets the residual score; a model that
+also has ``lower`` and ``upper`` gets the scores of conformalized quantile regression. A bundle
+keeps its method and gets thresholds from new data: a new site, another camera, other lighting.
 """
 
 from __future__ import annotations
@@ -76,31 +76,35 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a model file or the model of a bundle on a data set and write the new bundle.
 
-    The data set is one that the network has not been trained on: a tenth of it (role ``val``)
-    decides between scores and compares degrees of freedom, a fifth (``test``) is left for
-    ``evaluate``, the rest gives the thresholds; of a data set with a test list of its own that
-    list alone is taken. Where it is the very data set that the bundle's run was split from, that
-    run's own ``val`` and ``cal`` are used. ``rotation`` (None: ``tangent_predicted``) and ``crop``
-    (None: ``none``) describe a model file. ``new_data`` says that a data set of the training data's
-    name holds none of its frames. ``provider`` (None: the bundle's own, else ``onnxruntime``) is
-    the engine that the new bundle is for.
+    The network must not have been trained on the data set. A tenth of the frames (role ``val``)
+    chooses the score and compares degrees of freedom, a fifth (``test``) is reserved for
+    ``evaluate``, and the rest gives the thresholds. If the data set has its own test list, only
+    the sequences on that list are used. If the bundle's run was split from this data set, the
+    ``val`` and ``cal`` roles of that run are used.
+
+    ``rotation`` (None: ``tangent_predicted``) and ``crop`` (None: ``none``) describe a model file.
+    ``new_data`` states that a data set with the name of the training data contains none of its
+    frames. ``provider`` (None: the bundle's provider, or ``onnxruntime`` for a model file) is the
+    inference engine that the new bundle is made for.
 
     Raises
     ------
     ModelError, BundleMismatchError
-        The file is no model, or has other inputs and outputs.
+        The file is not a model, or its inputs and outputs do not fit.
     CalibrationFileError
-        The folder is no bundle.
+        The folder is not a bundle.
     SourceError, UsageError
-        The data set is too small, its frames do not pass the checks, or they may be those that the
-        network was trained on; or an option that has no meaning here.
+        The data set is too small, its frames do not pass the checks or may have been used for
+        training, or an option does not apply.
     SinkError
         The new folder cannot be written.
     """
     check_target(bundle_dir)
     if model.is_dir():
         if rotation is not None or crop is not None:
-            raise UsageError("rotation, crop: expected with an ONNX file, found with a bundle")
+            raise UsageError(
+                "rotation, crop: expected only with an ONNX file; a bundle states its own"
+            )
         bundle = read_bundle(model)
         split = _split_of(bundle.calibration, dataset, kind, seed, new_data)
         draft = Draft.of(bundle.calibration)
@@ -141,7 +145,7 @@ def _split_of(
     seed: int | None,
     new_data: bool,
 ) -> Split:
-    """The run's own split where the data set is the run's, else one of frames new to it."""
+    """Return the run's split if the data set is the run's, otherwise a new split."""
     trained_on, name = calibration.provenance.training_split, calibration.provenance.dataset
     if trained_on is None:
         return _new_split(dataset, kind, seed)
@@ -151,13 +155,14 @@ def _split_of(
         if dataset.name == name and not new_data:
             raise UsageError(
                 f"data set: expected frames that the network was not trained on, found other "
-                f"frames of the training data's name, {name}; --new-data says that they are new"
+                f"frames under the name of the training data, {name}; pass --new-data if none of "
+                "them was used for training"
             ) from None
         return _new_split(dataset, kind, seed)
     if kind is not None or seed is not None:
         raise UsageError(
-            "split, seed: expected none on the data set that the bundle was trained on, whose own "
-            "roles are used, found some"
+            "split, seed: cannot be chosen for the data set that the bundle was trained on; "
+            "its recorded split is used"
         )
     return split
 
@@ -169,7 +174,7 @@ def _new_split(dataset: PoseDataset, kind: SplitKind | None, seed: int | None) -
 
 def _read_model(path: Path) -> bytes:
     if not path.is_file():
-        raise ModelError(f"{path}: expected an ONNX file or a bundle folder, found none")
+        raise ModelError(f"{path}: expected an ONNX file or a bundle folder, found neither")
     try:
         return path.read_bytes()
     except OSError as error:
@@ -193,7 +198,7 @@ def _from_model(
     rotation: GivenRotation,
     crop: Crop,
 ) -> Draft:
-    """Draft for a model that nothing is known of but its tensors and the data's poses."""
+    """Return a draft for a model of which only the tensors and the data's poses are known."""
     spec = model_spec(model_bytes, _opset(model_bytes))
     outputs = {tensor.name: tensor.shape for tensor in spec.outputs}
     shape = spec.inputs[0].shape if len(spec.inputs) == 1 else ()
@@ -201,7 +206,7 @@ def _from_model(
     if outputs not in _FORMS or [_fields(tensor) for tensor in spec.inputs] != [image]:
         raise BundleMismatchError(
             "model: expected the input image uint8 [1, height, width, 3] and the outputs pose "
-            "[1, 7] or pose, lower, upper [1, 6], found "
+            "[1, 7], or pose [1, 7], lower [1, 6] and upper [1, 6], found "
             + ", ".join(
                 f"{t.name} {t.dtype} {list(t.shape)}" for t in (*spec.inputs, *spec.outputs)
             )
@@ -268,7 +273,7 @@ def _with_any_rotation(limits: PoseLimits) -> PoseLimits:
 
 
 def _with_wider_limits(draft: Draft, poses: Array) -> Draft:
-    """Let a bundle's limits hold the poses (n, 7) of the new data, too."""
+    """Widen a bundle's limits to include the poses (n, 7) of the new data."""
     pose = draft.pose
     if pose.reference_q_xyzw is None:
         coordinates = known_coordinates(poses, mean_rotation(poses[:, 3:]))

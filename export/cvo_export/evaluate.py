@@ -1,4 +1,4 @@
-"""Coverage, width and error of a bundle on held-out frames, through the runtime, as users do."""
+"""Coverage, width and error of a bundle on held-out frames, measured through the runtime."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from cvo_export.vocabulary import Subset
 Array = NDArray[np.float64]
 
 
-# What the table says of the claims that are not exact.
-_INDICATIVE = "? indicative: frames of one recording are no independent draws"
-_NO_CLAIM = "- no band: thresholds of clean frames promise nothing of noisy ones"
+# Footnotes for coverage bands that are not exact.
+_INDICATIVE = "? indicative: frames of one recording are not independent draws"
+_NO_CLAIM = "- no band: thresholds from clean frames guarantee nothing for noisy frames"
 
 
 def evaluate(
@@ -41,21 +41,20 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate every stored confidence and scope; the report of ``cvo-export evaluate --json``.
 
-    ``test``: the frames that the run recorded as test, found again by the split in the bundle;
-    ``all``: every frame of a data set that the run has not seen. Frames that a check flags are left
-    out and counted.
+    The subset ``test`` is the test role of the bundle's recorded split; ``all`` is every frame of
+    a data set that the run has not seen. Frames that a check flags are left out and counted.
 
-    With ``noise``, drawn by the split's seed, all frames are degraded. The bundle's own thresholds,
-    of clean frames, are evaluated beside those of the run's cal frames with the same noise
-    (``recalibrated``). Without, where the run was split by sequence, the other calibration rule is
-    evaluated beside the bundle's own.
+    ``noise`` degrades every frame, with the split's seed. The report then contains two sets of
+    figures: with the bundle's thresholds, which come from clean frames, and with thresholds from
+    the run's cal frames under the same noise (``recalibrated``). Without noise, a run that was
+    split by sequence is also evaluated with the other calibration rule (``other_rule``).
 
     Raises
     ------
     SourceError
         The data set is not the one that was split, or no frame passes the checks.
     UsageError
-        Noise on ``all``, or a calibration rule that is not computed here.
+        Noise with the subset ``all``.
     """
     bundle = read_bundle(bundle_dir)
     calibration = bundle.calibration
@@ -65,8 +64,8 @@ def evaluate(
     if noise is not None:
         if split is None:
             raise UsageError(
-                "noise: expected --subset test, as unseen data have no calibration frames to be "
-                f"recalibrated on, found {subset}"
+                "noise: expected --subset test, whose split has calibration frames to recalibrate "
+                f"on, found {subset}"
             )
         dataset = noisy(dataset, noise, recorded.seed)
     indices = subset_indices(calibration, dataset, subset)
@@ -75,7 +74,7 @@ def evaluate(
         bundle, threads=threads, confidence=first.confidence, scope=first.scope
     ) as odometer:
         seen = observe(odometer, dataset, indices)
-        # Clean frames and noisy ones are not exchangeable.
+        # Clean and noisy frames are not exchangeable, so no coverage can be claimed.
         sets = Sets(odometer, seen, calibration, claim if noise is None else "none")
         levels = sets.levels()
         report = {
@@ -94,7 +93,7 @@ def evaluate(
                 "invalid": seen.invalid,
             },
             "n_calibration": calibration.calibration.n,
-            # Then "all" may hold frames that the network was trained on.
+            # If true, the subset "all" may include frames that the network was trained on.
             "named_as_training_data": dataset.name == calibration.provenance.dataset,
             "point_error": point_error(seen),
             "own": sets.own(),
@@ -120,9 +119,9 @@ def evaluate(
 def subset_indices(
     calibration: Calibration, dataset: PoseDataset, subset: Subset
 ) -> NDArray[np.int64]:
-    """Frame numbers of the recorded test role, or all.
+    """Return the frame numbers of the recorded test role, or of all frames.
 
-    Raises SourceError where the data set is not the one that was split.
+    Raises SourceError if the data set is not the one that was split.
     """
     if subset == "all":
         return np.arange(len(dataset))
@@ -130,9 +129,9 @@ def subset_indices(
 
 
 def check_coverage(report: Mapping[str, Any], least: float) -> None:
-    """Raise GateError where a DoF's marginal coverage at 0.9 is below ``least``.
+    """Raise GateError if the marginal coverage of any DoF at 0.9 is below ``least``.
 
-    That of the bundle's own thresholds, also under noise.
+    The check always uses the bundle's own thresholds, also under noise.
     """
     level = find_level(report["levels"], 0.9, "marginal")
     worst = min(level["coverage"])
@@ -141,14 +140,14 @@ def check_coverage(report: Mapping[str, Any], least: float) -> None:
 
 
 def find_level(levels: list[dict[str, Any]], confidence: float, scope: str) -> dict[str, Any]:
-    """Return the entry for this confidence, one of those every bundle stores, and scope."""
+    """Return the entry for a confidence and a scope; every bundle stores the same confidences."""
     return next(
         level for level in levels if level["confidence"] == confidence and level["scope"] == scope
     )
 
 
 def table(report: Mapping[str, Any]) -> list[str]:
-    """Return the report as lines of text for a person."""
+    """Return the report as lines of readable text."""
     error, frames = report["point_error"], report["frames"]
     lines = [
         f"{report['bundle']} ({report['method']}, {report['score']} score) on {report['dataset']}, "
@@ -163,12 +162,15 @@ def table(report: Mapping[str, Any]) -> list[str]:
         noise = Noise(report["noise"]["name"], report["noise"]["strength"])
         lines.append(f"noise {noise} ({noise.unit}), seed {report['noise']['seed']}")
     if report["subset"] == "all" and report["named_as_training_data"]:
-        lines.append("the name is that of the training data: true only if no frame is of it")
+        lines.append(
+            "warning: this data set has the name of the training data; the figures hold only if "
+            "none of its frames was used for training"
+        )
     if report["own"] is not None:
         own = report["own"]
         coverage = " ".join(f"{value:.3f}" for value in own["coverage"])
         lines.append(
-            f"own bounds for 0.9, not calibrated: coverage {coverage}, all six "
+            f"the network's own bounds at 0.9, uncalibrated: coverage {coverage}, all six "
             f"{own['joint_coverage']:.3f}, score {own['normalised_interval_score']:.3f}"
         )
     if report["noise"] is None:
@@ -181,19 +183,19 @@ def table(report: Mapping[str, Any]) -> list[str]:
     return [
         *lines,
         "",
-        f"clean: the bundle's own thresholds, of {report['n_calibration']} frames without noise",
+        f"clean: the bundle's own thresholds, from {report['n_calibration']} frames without noise",
         *_level_lines(report["method"], report["rule"], report["levels"], _NO_CLAIM),
         *_sequence_lines(report["sequences"]),
         "",
-        f"recalibrated: thresholds of {again['n_calibration']} calibration frames with the same "
-        f"noise; left out {again['left_out']}",
+        f"recalibrated: thresholds from {again['n_calibration']} calibration frames with the same "
+        f"noise; {again['left_out']} left out",
         *_level_lines(report["method"], report["rule"], again["levels"]),
         *_sequence_lines(again["sequences"]),
     ]
 
 
 def _bounded(levels: list[dict[str, Any]], frames: int) -> int:
-    """Frames with finite bounds at the lowest stored confidence of all."""
+    """Return the number of frames with finite bounds at the lowest stored confidence."""
     lowest = min(levels, key=lambda level: level["confidence"])
     return round((1.0 - float(lowest["unbounded_share"])) * frames)
 
@@ -221,12 +223,12 @@ def _level_lines(
             own = HEADS[method].figures_text(level)
             lines.append(
                 f"{level['confidence']:<8g}{level['scope']:<12}{own + ', ' if own else ''}"
-                f"in pieces {100 * np.mean(level['disjoint_share']):.1f} % of sets, "
+                f"disjoint {100 * np.mean(level['disjoint_share']):.1f} % of sets, "
                 f"{100 * level['disjoint_frames']:.0f} % of frames"
             )
     lines += [
-        f"{level['confidence']:<8g}{level['scope']:<12}volume over that of the poses' deviations, "
-        f"to the power 1/6: {level['joint_volume']['geometric_mean'] ** (1 / 6):.3f}"
+        f"{level['confidence']:<8g}{level['scope']:<12}volume in units of the poses' standard "
+        f"deviations, to the power 1/6: {level['joint_volume']['geometric_mean'] ** (1 / 6):.3f}"
         for level in levels
         if level["confidence"] == 0.9 and "joint_volume" in level
     ]
@@ -248,7 +250,7 @@ def _sequence_lines(sequences: Mapping[str, Any]) -> list[str]:
 def _recalibrated(
     odometer: Odometer, dataset: PoseDataset, split: Split, draft: Calibration
 ) -> Calibration:
-    """Return the draft with thresholds of the run's cal frames, as this data set shows them."""
+    """Return the draft with thresholds from the run's cal frames, read from this data set."""
     val, cal = (observe(odometer, dataset, split.roles[role]) for role in ("val", "cal"))
     return with_thresholds(draft, odometer.head, val, cal)
 

@@ -1,4 +1,4 @@
-"""Result files as JSON: written whole or not at all, read strictly."""
+"""JSON result files: written atomically, read strictly."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ T = TypeVar("T")
 
 
 def write_json(path: Path, content: object) -> None:
-    """Write structs, mappings and lists as indented JSON, and make the folder; raises SinkError."""
+    """Write structs, mappings and lists as indented JSON, creating the folder if necessary.
+
+    Raises SinkError.
+    """
     text = msgspec.json.format(msgspec.json.encode(content), indent=1).decode()
     write_whole(path, text + "\n", make_folder=True)
 
 
 def read_json(path: Path, kind: type[T], what: str) -> T:
-    """Read what ``write_json`` wrote; raises UsageError where the file does not hold ``what``."""
+    """Read a file that ``write_json`` wrote; raises UsageError if it does not hold ``what``."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise UsageError(f"{path}: expected {what}, found {error}") from None
     except OSError as error:
-        raise UsageError(f"{path}: expected {what}, cannot be read: {error.strerror}") from None
+        raise UsageError(f"{path}: expected {what}; cannot be read: {error.strerror}") from None

@@ -1,4 +1,4 @@
-"""A picture of a bundle on a data set: truth, point and set over time, and seen from above."""
+"""Plot a bundle on a data set: truth, point estimate and set over time, and a top view."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Colours that differ for colour-blind readers, too (Okabe and Ito 2008).
+# Colours that colour-blind readers can tell apart (Okabe and Ito 2008).
 TRUTH, POINT, BAND, MISSED = "#000000", "#0072B2", "#56B4E9", "#D55E00"
-# More boxes than these hide one another.
+# More boxes would hide one another.
 BOXES = 60
 _DPI = 130
 
@@ -42,31 +42,34 @@ def plot(
     confidence: float = 0.9,
     scope: Scope = "marginal",
 ) -> None:
-    """Draw each degree of freedom over the frames, and x against y, into one picture.
+    """Draw each degree of freedom over the frames, and x against y, into one figure.
 
-    Bands of a set in pieces are drawn apart; frames whose truth is outside are marked. Rotation
-    numbers are shown in degrees, an offset about the prediction as it is. ``sequence`` is a name of
-    the data set's, by default all frames of the subset in their order.
+    The bands of a disjoint set are drawn separately, and frames whose truth lies outside the set
+    are marked. Rotations are in degrees; in a chart about the prediction they are offsets from it.
+    ``sequence`` names one sequence of the data set; None draws all frames of the subset in order.
 
     Raises
     ------
     UsageError
-        matplotlib is not installed, or there is no such sequence.
+        matplotlib is not installed, the file format is not supported, or the data set has no such
+        sequence.
     SourceError
-        No frame gives a pose.
+        No frame has a pose.
     SinkError
-        The picture cannot be written.
+        The figure cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
         raise UsageError(
-            'plot: expected matplotlib, found none; pip install "cvo-export[plot]"'
+            'plot: matplotlib is not installed; pip install "cvo-export[plot]"'
         ) from None
     known = FigureCanvasAgg(Figure()).get_supported_filetypes()
     if out.suffix[1:].lower() not in known or out.is_dir():
-        raise UsageError(f"out: expected a file .{', .'.join(sorted(known))}, found {out}")
+        raise UsageError(
+            f"out: expected a file name ending in .{', .'.join(sorted(known))}, found {out}"
+        )
     drawn = track(bundle_dir, dataset, subset, sequence, confidence, scope)
     figure = Figure(figsize=(15, 11), layout="constrained")
     grid = figure.add_gridspec(3, 3)
@@ -84,9 +87,10 @@ def plot(
 
 
 class Track(NamedTuple):
-    """Frames through a bundle: every estimate, true numbers (n, 6) in its chart, NaN without one.
+    """A bundle's estimates for n frames, with the truth.
 
-    ``rows`` are the frames whose estimate has a pose.
+    ``truth`` (n, 6) holds the true poses in the bundle's chart, NaN for frames without an
+    estimate; ``rows`` are the positions of the frames whose estimate has a pose.
     """
 
     calibration: Calibration
@@ -104,9 +108,9 @@ def track(
     confidence: float = 0.9,
     scope: Scope = "marginal",
 ) -> Track:
-    """Run frames through a bundle, those of one sequence or all of a subset.
+    """Run the frames of a subset, or those of one sequence in it, through a bundle.
 
-    Raises UsageError for an unknown sequence, SourceError where no frame gives a pose.
+    Raises UsageError for an unknown sequence and SourceError if no frame has a pose.
     """
     with Odometer.load(bundle_dir, confidence=confidence, scope=scope) as odometer:
         indices = subset_indices(odometer.calibration, dataset, subset)
@@ -131,14 +135,15 @@ def _step(odometer: Odometer, dataset: PoseDataset, index: int) -> PoseInterval:
         image: Any = dataset.read_image(index)
     except SourceError:
         image = None
-    # A stream of its own: drawn frames need not follow one another, and `evaluate` compares none.
+    # One stream per frame: the frames need not be consecutive, and stream checks must not flag
+    # them here, because `evaluate` does not apply stream checks either.
     frame = Frame(image, None, dataset.frame_names[index], 0.0)
     (estimate,) = odometer.stream([frame])
     return estimate
 
 
 def _truth(chart: Chart, estimates: list[PoseInterval], poses: Array) -> Array:
-    """True numbers (n, 6) in the chart as seen from each estimate; NaN where there is none."""
+    """Return the true poses (n, 6) in the chart at each estimate; NaN for invalid estimates."""
     truth = np.full((len(estimates), 6), np.nan)
     for row, (estimate, pose) in enumerate(zip(estimates, poses, strict=True)):
         if estimate.pose is not None:
@@ -147,7 +152,7 @@ def _truth(chart: Chart, estimates: list[PoseInterval], poses: Array) -> Array:
 
 
 def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
-    """Draw one degree of freedom over the frames: sets, point, truth, and what was missed."""
+    """Draw one degree of freedom over the frames: sets, point, truth and missed frames."""
     _, chart, estimates, truth, rows = drawn
     scale, unit = (1.0, "m") if dof < 3 else (float(np.rad2deg(1.0)), "deg")
     shown = scale * truth[rows, dof]
@@ -165,7 +170,7 @@ def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
             bottoms.append(bottom)
             heights.append(top - bottom)
             places.append(row)
-        # A region of all six misses as a whole.
+        # An ellipsoidal region holds all six degrees of freedom or misses them together.
         whole = estimate.conformal_set.ellipsoids
         if not (
             whole.contains(truth[row]) if whole else estimate.conformal_set.covers(truth[row])[dof]
@@ -175,7 +180,7 @@ def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
     axes.plot(rows, scale * point, color=POINT, linewidth=0.9, label="point")
     axes.plot(rows, shown, color=TRUTH, linewidth=0.9, label="truth")
     regions = any(estimates[row].conformal_set.ellipsoids for row in rows)
-    label = "outside of the region of all six" if regions else "missed"
+    label = "outside the six-DoF region" if regions else "missed"
     axes.plot(missed, scale * truth[missed, dof], "x", color=MISSED, markersize=5, label=label)
     axes.set_ylim(shown.min() - 0.4 * spread, shown.max() + 0.4 * spread)
     kind = " about the prediction" if dof > 2 and chart.rotation == "tangent_predicted" else ""
@@ -187,7 +192,7 @@ def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
 
 
 def draw_from_above(axes: Axes, drawn: Track) -> None:
-    """X against y: the product of both sets as boxes, for as many frames as can be told apart."""
+    """Draw x against y: the product of both sets as boxes, for at most about ``BOXES`` frames."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
@@ -204,12 +209,12 @@ def draw_from_above(axes: Axes, drawn: Track) -> None:
     axes.set_xlabel("tx (m)")
     axes.set_ylabel("ty (m)")
     axes.set_aspect("equal", "datalim")
-    axes.set_title("x and y, sets of every so many frames", fontsize=10)
+    axes.set_title("x and y, with the sets of evenly spaced frames", fontsize=10)
     axes.legend(loc="best", fontsize=8)
 
 
 def _array(estimate: PoseInterval) -> Array:
-    """The pose (7,) of an estimate that has one."""
+    """Return the pose (7,) of an estimate; raises UsageError if it has none."""
     if estimate.pose is None:
         raise UsageError(f"frame {estimate.seq} is invalid: it has no pose")
     return estimate.pose.to_array()

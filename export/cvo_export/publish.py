@@ -1,4 +1,4 @@
-"""A run folder -> a bundle: export, parity, calibration, self-test, written whole or not at all."""
+"""Publish a run as a bundle: export, parity check, calibration, self-test and atomic write."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 _PACKAGES = ("cvo-edge", "cvo-export", "torch", "timm", "onnx", "onnxruntime", "numpy")
 _PARITY_FRAMES = 32
-# Frames that show how far the numbers of a feature map reach.
+# Frames that give the value ranges of the feature maps for quantisation.
 _RANGE_FRAMES = 128
 
 
@@ -51,22 +51,22 @@ def publish(
     precision: Precision = "fp32",
     provider: Provider = "onnxruntime",
 ) -> Calibration:
-    """Export and calibrate a finished run and write its bundle; returns the calibration.
+    """Export and calibrate a finished run, write its bundle and return the calibration.
 
-    ``rule`` None is ``hierarchical`` for a run split by sequence, else ``pooled``; ``score`` None
-    lets val decide. With ``int8`` the backbone is quantised first: scores and thresholds are those
-    of the very graph in the bundle, as the ``provider`` computes it.
+    ``rule`` None means ``hierarchical`` for a run split by sequence and ``pooled`` otherwise;
+    ``score`` None chooses the score on the val frames. ``int8`` quantises the backbone before
+    calibration. Scores and thresholds always come from the exported graph, run by ``provider``.
 
     Raises
     ------
     GateError
         torch and onnxruntime disagree, or the written bundle fails its own self-test.
     SinkError
-        The folder cannot be written, or holds something that is no bundle.
+        The folder cannot be written, or contains files that do not belong to a bundle.
     UsageError
-        A score or sides that the method does not have.
+        The method does not have the requested score or sides.
     ModelError
-        The provider is not installed, or does not know the graph.
+        The provider is not installed, or cannot run the graph.
     """
     check_target(bundle_dir)
     candidates = selected(run.graph.head.candidates(), score, sides)
@@ -79,9 +79,9 @@ def publish(
 
 
 def _export(run: Run, precision: Precision) -> tuple[bytes, float]:
-    """Model bytes, and the largest difference between torch and onnxruntime on frames of val.
+    """Return the model bytes and the largest difference between torch and onnxruntime on val.
 
-    That difference is of the float32 graph, which the quantised one is made of.
+    The difference is measured on the float32 graph, before any quantisation.
     """
     config, head = run.config, run.graph.head
     image = torch.zeros((1, config.height, config.width, 3), dtype=torch.uint8)
@@ -105,7 +105,7 @@ def _export(run: Run, precision: Precision) -> tuple[bytes, float]:
 
 
 def _feeds(run: Run, indices: NDArray[np.int64]) -> list[dict[str, NDArray[np.generic]]]:
-    """Model inputs of these frames; extra inputs are standard normal noise."""
+    """Return the model inputs for these frames; extra inputs are standard normal noise."""
     config, generator = run.config, np.random.default_rng(0)
     feeds = []
     for index in indices.tolist():
@@ -122,13 +122,13 @@ def _feeds(run: Run, indices: NDArray[np.int64]) -> list[dict[str, NDArray[np.ge
 def _compare(
     expected: Mapping[str, NDArray[np.float32]], found: Mapping[str, NDArray[np.float32]]
 ) -> None:
-    """Raise GateError where the completed graph computes other bits than its reference."""
+    """Raise GateError if the completed graph is not bit-identical to its reference."""
     for name, values in expected.items():
         if not np.array_equal(values, found[name]):
             worst = float(np.abs(values - found[name]).max())
             raise GateError(
-                f"export: expected {name} of the graph to equal its reference, found a difference "
-                f"of {worst:.3g}"
+                f"export: expected output {name} of the graph to equal its reference, found a "
+                f"difference of {worst:.3g}"
             )
 
 
@@ -141,11 +141,12 @@ def _draft(
     parity: float,
     provider: Provider,
 ) -> Draft:
-    """Everything but score, thresholds and self-test."""
+    """Return the bundle's content except its score, thresholds and self-test."""
     config, target = run.config, run.target
     roles = run.split.roles
     model = model_spec(model_bytes, OPSET, provider)
-    # Of all frames of these roles, also where a run was given a share: the unit of its score.
+    # Use all train and fit frames even if the run used a share of them: these poses set the
+    # limits, and the unit in which scores are compared.
     known = target.coordinates(run.dataset.poses[np.concatenate([roles["train"], roles["fit"]])])
     return Draft(
         name=name,
@@ -195,7 +196,7 @@ def _draft(
 
 
 def _options(run: Run) -> Mapping[str, str | int | float | bool | None]:
-    """Flatten the run's configuration; data set and weights are named elsewhere, without paths."""
+    """Flatten the run's configuration, without the entries that the bundle stores elsewhere."""
     flat: dict[str, str | int | float | bool | None] = {}
 
     def add(prefix: str, values: Mapping[str, object]) -> None:

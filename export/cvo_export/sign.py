@@ -1,4 +1,4 @@
-"""Signing a bundle: the private key's side of ``cvo_edge.bundle.signature``."""
+"""Sign bundles with a private key; ``cvo_edge.bundle.signature`` verifies the signatures."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ from cvo_export.files import write_json
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-# An encrypted key's passphrase, in the environment: on a command line others would see it.
-PASSPHRASE = "CVO_SIGNING_PASSPHRASE"  # noqa: S105 - its name
+# An environment variable, because other users could see a passphrase on the command line.
+PASSPHRASE = "CVO_SIGNING_PASSPHRASE"  # noqa: S105 - the variable's name, not a passphrase
 
 
 def sign(folder: Path, key: Path, version: int | None = None) -> Signature:
-    """Sign a bundle with an Ed25519 private key (PEM), in place of any signature it has.
+    """Sign a bundle with an Ed25519 private key (PEM); replaces any existing signature.
 
     Parameters
     ----------
     folder
-        The bundle; read and checked as a device does it.
+        The bundle; it is read and checked in the same way as on a device.
     key
-        PEM file; the passphrase of an encrypted one is taken from ``CVO_SIGNING_PASSPHRASE``.
+        PEM file; ``CVO_SIGNING_PASSPHRASE`` gives the passphrase of an encrypted key.
     version
-        A device that has run one refuses lower ones of the same name; by default the seconds since
-        1970.
+        A device that has run this version refuses lower versions of the same name. None: the
+        seconds since 1970.
 
     Raises
     ------
     UsageError
-        No such key, or a version out of range.
+        The key cannot be read, or the version is out of range.
     CalibrationFileError, ModelError, BundleMismatchError
-        No bundle that a device would read.
+        A device would refuse the bundle.
     SinkError
         The signature cannot be written.
     """
@@ -82,7 +82,7 @@ def _private_key(path: Path) -> Ed25519PrivateKey:
         from cryptography.hazmat.primitives.serialization import load_pem_private_key
     except ImportError:
         raise UsageError(
-            "sign: expected the extra [sign] (pip install 'cvo-edge[sign]'), found no cryptography"
+            "sign: the package cryptography is not installed; pip install 'cvo-edge[sign]'"
         ) from None
     passphrase = os.environ.get(PASSPHRASE)
     try:
@@ -92,13 +92,15 @@ def _private_key(path: Path) -> Ed25519PrivateKey:
         )
     except TypeError:
         raise UsageError(
-            f"{path}: expected {PASSPHRASE} to be set for an encrypted key and for no other, found "
-            f"it {'set' if passphrase else 'not set'}"
+            f"{path}: the key is not encrypted, but {PASSPHRASE} is set; unset it"
+            if passphrase
+            else f"{path}: the key is encrypted; set {PASSPHRASE} to its passphrase"
         ) from None
     except (ValueError, UnsupportedAlgorithm):
         raise UsageError(
-            f"{path}: expected an Ed25519 private key in PEM form and its passphrase, found none"
+            f"{path}: expected an Ed25519 private key in PEM form, with the right passphrase if "
+            "it is encrypted; the file cannot be decoded"
         ) from None
     if not isinstance(private, Ed25519PrivateKey):
-        raise UsageError(f"{path}: expected an Ed25519 private key, found one of another kind")
+        raise UsageError(f"{path}: expected an Ed25519 private key, found another type of key")
     return private

@@ -1,4 +1,4 @@
-"""One tiny run, trained once: random weights, small images, a few hundred steps."""
+"""A tiny run that is trained once: random weights, small images, a few hundred steps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cvo_export.publish import publish
 from cvo_export.training.loop import train
 from cvo_export.training.run import Run, TrainConfig
 
-# Networks this small wait for threads longer than they compute.
+# For networks this small, several threads only add overhead.
 torch.set_num_threads(1)
 
 DATASET = "synthetic:room,flights=8,frames=40,size=64x48"
@@ -40,7 +40,7 @@ def tiny_config(**changes: Any) -> TrainConfig:
 
 
 def ignore_progress(stage: str, done: int, total: int, note: str = "") -> None:
-    """Nobody watches."""
+    """Discard progress reports."""
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Backbones: any timm model, cut and pooled; pooling against torch's own; weights refused."""
+"""Backbones: truncated and pooled timm models, pooling against torch, invalid weights."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Baselines from training to bundle; their bounds against their definitions."""
+"""Baselines from training to bundle, and their bounds against their definitions."""
 
 import json
 import math
@@ -41,7 +41,7 @@ Z = norm.ppf(0.95)
 
 
 def config_of(name):
-    # An early stage and few units: small graphs and checkpoints.
+    # An early stage and few units keep graphs and checkpoints small.
     backbone = BackboneConfig(stages=("8",), grid=(3, 4))
     return tiny_config(head=BASELINES[name].config(hidden=(64, 32)), backbone=backbone)
 
@@ -68,13 +68,13 @@ def runs(tmp_path_factory):
 
 
 def standardised(run, outputs):
-    """Lower and upper of the graph, in the network's own units."""
+    """Return the graph's lower and upper bounds in the network's units."""
     return [(outputs[key] - run.target.mean) / run.target.std for key in ("lower", "upper")]
 
 
 @pytest.fixture(scope="module")
 def seen(runs):
-    """Features of a few frames (torch), and what the exported graph gives for them."""
+    """Features of a few frames in torch, and the exported graph's outputs for them."""
 
     def of(name):
         _, run, bundle = runs(name)
@@ -152,7 +152,7 @@ def test_only_the_point_network_has_the_residual_score(runs, tmp_path):
         publish(run, tmp_path / "bundle", "other", score="residual")
 
 
-# -- the bounds of the graph, and their definitions ----------------------------------------------
+# -- bounds of the graph against their definitions -----------------------------------------------
 
 
 def gaussian_of(points):
@@ -205,7 +205,7 @@ def test_ensemble_bounds_are_those_of_the_mixture_of_five_networks_one_by_one(se
     found = np.array([member(x).detach().numpy() for member in network.members]).astype(float)
     mean, variance = found[..., :6], np.exp(found[..., 6:])
     assert len(mean) == 5
-    # Second moment of the mixture less the square of its mean.
+    # Second moment of the mixture minus the square of its mean.
     deviation = np.sqrt((variance + mean**2).mean(axis=0) - mean.mean(axis=0) ** 2)
     point = mean.mean(axis=0)
     assert_bounds(run, outputs, (point - Z * deviation, point + Z * deviation))
@@ -283,7 +283,7 @@ def test_quantiles_of_mixtures_far_apart_and_narrow_are_found():
         for row, dof in np.ndindex(40, 6):
             at = (weight[row, dof], mean[row, dof], deviation[row, dof])
             exact = brentq(lambda y, a=at, p=level: mixture_cdf(np.array(y), *a) - p, -60, 60)
-            # As far off as its level is by rounding, where the density is low.
+            # Where the density is low, a small error in the level moves the quantile further.
             assert abs(mixture_cdf(found[row, side, dof], *at) - level) < 1e-4
             assert abs(found[row, side, dof] - exact) < 1e-3
 
@@ -328,7 +328,7 @@ def test_the_pinball_loss_is_least_at_the_quantiles():
             assert loss(moved) > loss(exact)
 
 
-# -- what the report says of them ----------------------------------------------------------------
+# -- their figures in the report -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["gaussian", "split"])
@@ -372,7 +372,7 @@ def test_joint_volume_is_the_product_of_the_widths(runs):
     assert found["mean"] == pytest.approx(np.mean(volumes))
     assert found["median"] == pytest.approx(np.median(volumes))
     assert found["geometric_mean"] == pytest.approx(np.exp(np.mean(np.log(volumes))))
-    # Unbounded, it is the workspace.
+    # Unbounded sets are limited to the workspace.
     limits = read_calibration(bundle).pose.limits
     space = np.prod((np.array(limits.highest) - limits.lowest) / run.target.std)
     found = find_level(levels, 0.99, "joint")["joint_volume"]

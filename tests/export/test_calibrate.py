@@ -1,4 +1,4 @@
-"""A network that is already there: its own ONNX file, or the model of a bundle."""
+"""Calibration of existing networks: an ONNX file or the model of a bundle."""
 
 import subprocess
 import sys
@@ -31,7 +31,7 @@ def dataset():
 
 
 def own_model(dataset, bounds, height=48, width=64, outputs=("pose", "lower", "upper")):
-    """A small network of another workshop: the mean colour says where the camera is, roughly."""
+    """A small network from elsewhere, which estimates the position from the mean colour."""
     generator = np.random.default_rng(0)
     rotation = mean_rotation(dataset.poses[:, 3:]).astype(np.float32)
     centre = dataset.poses[:, :3].mean(axis=0).astype(np.float32)
@@ -115,7 +115,7 @@ def test_sides_joint_scope_and_rule_are_those_asked_for(model_file, dataset, tmp
     assert calibration.method_parameters["sides"] == "asymmetric"
     assert calibration.calibration.joint == "bonferroni"
     assert calibration.calibration.rule == "hierarchical"
-    # 8 sequences at 0.9, two-sided: not enough for a finite threshold.
+    # 8 sequences are too few for a finite two-sided threshold at 0.9.
     assert calibration.threshold(0.9, "marginal").q_hat == (None,) * 6
 
 
@@ -141,7 +141,7 @@ def test_what_two_sides_and_bonferroni_would_need_is_said(model_file, dataset, t
             joint="bonferroni",
         )
     )
-    # 168 frames: each side at 0.995 needs 199; at a sixth of 0.05, half a side, 239.
+    # Half of 0.01 per side needs 199 frames; half of a sixth of 0.05 needs 239.
     assert "unbounded    at 0.99 marginal: needs at least 199 calibration frames, has 168" in lines
     assert "unbounded    at 0.95 joint: needs at least 239 calibration frames, has 168" in lines
 
@@ -164,7 +164,7 @@ def test_a_bundle_keeps_its_model_and_method_on_new_data(tiny_bundle, dataset, t
 
 
 def test_on_the_runs_own_data_the_frames_it_trained_on_stay_out(tiny_bundle, tiny_run, tmp_path):
-    # The same val and cal as the run, so the same thresholds to the last bit.
+    # The val and cal frames are the run's, so the thresholds are bit-identical.
     before = read_calibration(tiny_bundle)
     after = calibrate(
         tiny_bundle, tiny_run.dataset, tmp_path / "b", "again", score=before.calibration.score
@@ -174,7 +174,7 @@ def test_on_the_runs_own_data_the_frames_it_trained_on_stay_out(tiny_bundle, tin
 
 
 def test_other_frames_of_the_training_datas_name_need_a_word(tiny_bundle, tmp_path):
-    # Eight of the nine flights are those that the network was trained on.
+    # The network was trained on eight of the nine flights.
     superset = open_dataset("synthetic:room,flights=9,frames=40,size=64x48")
     with pytest.raises(UsageError, match="--new-data"):
         calibrate(tiny_bundle, superset, tmp_path / "b", "leak", kind="random")
@@ -195,12 +195,12 @@ def test_the_run_is_remembered_when_a_bundle_comes_back_to_its_own_data(
 
 @pytest.mark.parametrize("given", [{"rotation": "euler_zyx"}, {"crop": "centre"}])
 def test_options_of_a_model_file_are_refused_with_a_bundle(tiny_bundle, dataset, tmp_path, given):
-    with pytest.raises(UsageError, match="expected with an ONNX file"):
+    with pytest.raises(UsageError, match="expected only with an ONNX file"):
         calibrate(tiny_bundle, dataset, tmp_path / "b", "b", **given)
 
 
 def test_a_split_is_not_asked_for_on_the_runs_own_data(tiny_bundle, tiny_run, tmp_path):
-    with pytest.raises(UsageError, match="whose own roles are used"):
+    with pytest.raises(UsageError, match="its recorded split is used"):
         calibrate(tiny_bundle, tiny_run.dataset, tmp_path / "b", "b", kind="random")
 
 

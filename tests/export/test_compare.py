@@ -1,4 +1,4 @@
-"""The comparison: every cell once, the same figures whoever runs it, and what is refused."""
+"""The comparison: each cell runs once, with results that do not depend on the process."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ METHODS = ["split", "gaussian"]
 
 @pytest.fixture(scope="module")
 def options(tmp_path_factory):
-    """Options of the grid; the weights are a file, as random ones share no features."""
+    """Options of the grid; runs share features only if their weights come from a file."""
     path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
     torch.manual_seed(5)
     body = Backbone(BackboneConfig(stages=("8",), grid=(3, 4)), 48, 64).body
@@ -52,13 +52,13 @@ def compared_again(out, options, jobs=1, **changes):
     grid = Grid(name="compare", **{**options, **changes})
     folder = CellFolder.in_folder(out, None)
     lines = compare(grid, folder, partial(run_tasks, jobs), ignore_progress, said.append)
-    # The first line is about the data set.
+    # The first line describes the data set.
     return lines, said[1:]
 
 
 @pytest.fixture(scope="module")
 def compared(options, tmp_path_factory):
-    """Seed 0 in this process, seed 1 in two others; and what was said of them."""
+    """Results and messages of a comparison: seed 0 in this process, seed 1 in two others."""
     out = tmp_path_factory.mktemp("compare") / "out"
     _, first = compared_again(out, options, seeds=1)
     lines, second = compared_again(out, options, jobs=2)
@@ -67,12 +67,12 @@ def compared(options, tmp_path_factory):
 
 @pytest.fixture
 def copied(compared, tmp_path):
-    """A copy that a test may change."""
+    """A copy of the results that a test may change."""
     return shutil.copytree(compared[0], tmp_path / "out")
 
 
 def path_of(out, name):
-    """The file of the cell METHOD-SEED."""
+    """Return the file of the cell METHOD-SEED."""
     (found,) = (out / "cells").glob(f"*-{name}-????????.json")
     return found
 
@@ -86,7 +86,7 @@ def cells_of(out):
 
 
 def short(text):
-    """METHOD-SEED at the end of a cell's name, before its digest."""
+    """Return METHOD-SEED, which precedes the digest in a cell's name."""
     return "-".join(text.split(":")[0].split("-")[-3:-1])
 
 
@@ -97,7 +97,7 @@ def test_every_cell_is_run_once_and_said(compared):
     assert [short(line) for line in first] == ["split-0", "gaussian-0"]
     assert sorted(short(line) for line in second) == ["gaussian-1", "split-1"]
     assert all(line.endswith(f"({i} of 2)") for i, line in enumerate(first, 1))
-    # One folder of features a seed, none in a run.
+    # Each seed has one folder of features; the runs have none.
     assert len(list((out / "features").iterdir())) == 2
     assert not list((out / "runs").glob("*/features*"))
 
@@ -186,7 +186,7 @@ def test_a_failed_cell_is_named_and_the_others_are_run(copied, options):
     (copied / "bundles" / split.stem / "precious.txt").write_text("keep")
     with pytest.raises(SinkError, match=rf"1 of 2 cells failed \({split.stem}\); the same command"):
         compared_again(copied, options)
-    # The run was complete already, so its training time is not known.
+    # The run was already complete, so its training time is unknown.
     assert cell(copied, "gaussian-0")["training"] is None
     assert not split.exists()
 

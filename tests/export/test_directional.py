@@ -1,4 +1,4 @@
-"""Directional quantiles: rays and half-spaces agree, regions hold what they should."""
+"""Directional quantiles: rays agree with half-spaces, and regions have the stated coverage."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def condition():
 
 
 def latents(network, c, kappa):
-    """Latents of the codebook, before they are decoded, (n, J, 3)."""
+    """Return the codebook's latents before decoding, (n, J, 3)."""
     network._decoded = lambda z, c: z
     with torch.no_grad():
         return network.codebook(c, torch.tensor(kappa))
@@ -41,7 +41,7 @@ def test_directions_are_unit_vectors_spread_over_the_sphere():
     points = fibonacci_sphere(128)
     torch.testing.assert_close(points.norm(dim=1), torch.ones(128))
     assert points.mean(dim=0).abs().max() < 0.02
-    # No hole: everywhere on the sphere there is a direction within 15 degrees.
+    # Every point of the sphere has a direction within 15 degrees.
     others = fibonacci_sphere(1000)
     assert (others @ points.T).amax(dim=1).min() > np.cos(np.deg2rad(15.0))
 
@@ -53,7 +53,7 @@ def test_the_codebook_fills_the_half_spaces_to_the_edge_and_not_beyond(network, 
         above = z @ network.directions.T - quantile[:, None]
     assert z.shape == (3, 1 + 128 * len(SHELLS), 3)
     assert above.min() > -1e-4
-    # A ray's last point lies on the first half-space's border that it meets.
+    # The last point of a ray lies on the border of the first half-space that it meets.
     torch.testing.assert_close(above[:, -128:].amin(dim=2), torch.zeros(3, 128), atol=1e-4, rtol=0)
     assert above[:, 0].min() > 0.0
 
@@ -103,7 +103,7 @@ def test_the_constant_of_least_pinball_loss_is_the_quantile(tau):
 
 
 def fitted(make, steps=400):
-    """A network fitted for a moment to y (n, 2) given x (n, 1)."""
+    """Return a network briefly fitted to y (n, 2) given x (n, 1)."""
     torch.manual_seed(0)
     generator = np.random.default_rng(0)
     network = RegionNetwork(RegionConfig(response=2, condition=1))
@@ -136,7 +136,7 @@ def test_a_region_of_two_pieces_covers_them_and_little_of_the_gap():
     scores = scaled_distances(codebook, scale, y)
     radius = conformal_quantile(scores[:400], 0.9)
     assert (scores[400:] <= radius).mean() > 0.8
-    # A decoder is continuous: it may bridge the gap, but not fill it.
+    # The decoder is continuous, so the region may bridge the gap but must not fill it.
     across = generator.uniform(-1.0, 1.0, y.shape) * (0.7 + 2.0 * x)
     between = np.abs(across).max(axis=1) < 0.5 + 2.0 * x[:, 0]
     assert (scaled_distances(codebook, scale, across)[between] <= radius).mean() < 0.1
@@ -154,7 +154,7 @@ def test_the_scale_follows_what_the_condition_says_of_the_spread():
 
 
 def test_a_region_that_is_no_larger_than_its_radius_has_the_volume_of_discs():
-    # Without a local scale and with one point: a disc about it, whose radius covers 90 %.
+    # With one point and no local scale, the region is a disc about it whose radius covers 90 %.
     torch.manual_seed(0)
     network = RegionNetwork(RegionConfig(response=2, condition=1, local_scale=False)).eval()
     c, y = torch.zeros(100, 1), np.random.default_rng(3).standard_normal((100, 2))
@@ -194,7 +194,7 @@ def test_a_codebook_stays_only_where_the_shape_needs_one():
         assert len(thrifty.points) <= len(best.points)
         volume, least = (mean_volume(network, c[:150], y[:150], z) for z in (thrifty, best))
         assert volume <= 1.02 * least
-    # A Gaussian is an ellipse, two pieces are none.
+    # One ellipse describes a Gaussian but not two separate pieces.
     assert kept[leaning].tolist() == [0]
     assert len(kept[two_pieces]) > 1
 

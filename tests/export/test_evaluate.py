@@ -1,4 +1,4 @@
-"""Evaluation: keys, bands, gates, and agreement with the odometer frame by frame."""
+"""Evaluation: report keys, coverage bands, gates, and agreement with the odometer per frame."""
 
 import json
 import subprocess
@@ -101,7 +101,7 @@ def test_table_shows_every_level(report):
     text = "\n".join(table(report))
     assert text.count("marginal") == 5
     assert text.count("joint ") >= 5
-    assert text.count("-   ") >= 2  # no band where the set is everything
+    assert text.count("-   ") >= 2  # unbounded sets have no band
 
 
 def cvo_export(*arguments):

@@ -1,4 +1,4 @@
-"""The forest's weights and quantiles against independent ones, and the graph against numpy."""
+"""Forest weights and quantiles against independent implementations; the graph against numpy."""
 
 import numpy as np
 import pytest
@@ -50,8 +50,8 @@ def graph_of(forest, taus):
 
 
 def test_no_quantile_of_the_graph_differs_from_the_float64_reference(forest):
-    # 1000 inputs x 3 outputs x 2 levels: 6000 quantiles. Half of the inputs are training rows,
-    # which lie exactly on no threshold but near many.
+    # 1000 inputs x 3 outputs x 2 levels give 6000 quantiles. Half of the inputs are training rows,
+    # which lie near many thresholds but never exactly on one.
     x = np.concatenate([data(500, seed=9)[0], data(600)[0][:500]])
     taus = (0.05, 0.95)
     session = graph_of(forest, taus)
@@ -101,10 +101,10 @@ def test_a_quantile_is_the_least_label_whose_distribution_reaches_the_level(fore
 
 @pytest.mark.parametrize("tau", [0.05, 0.5, 0.95])
 def test_quantiles_agree_with_quantile_forest_up_to_one_weight(tau):
-    # quantile-forest sees only the rows in a tree's bag, so trees are grown without bootstrap here;
-    # with all samples of a leaf kept and leaves weighted inversely to their size, its weights
-    # are Meinshausen's. Its quantile is at the rank (N - 1) tau + 1 between two labels, ours the
-    # first label that reaches tau: on the scale of F they differ by less than two weights.
+    # quantile-forest uses only the rows in a tree's bag, so these trees have no bootstrap. If it
+    # keeps all samples of a leaf and weights leaves inversely to their size, its weights are
+    # Meinshausen's. It interpolates between two labels at the rank (N - 1) tau + 1; ours is the
+    # first label that reaches tau. On the scale of F, the two differ by less than two weights.
     x, y = data(400, outputs=1)
     new, _ = data(200, seed=7)
     settings = {"min_samples_leaf": LEAF, "max_features": 0.5, "random_state": 0}

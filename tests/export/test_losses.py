@@ -1,4 +1,4 @@
-"""Minimisers of the losses, by optimisation on samples of a known distribution."""
+"""The minimisers of the losses, found by optimisation on samples of known distributions."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""CQR, CSP and MCQR from training to bundle: what holds for every method, and what for each."""
+"""CQR, CSP and MCQR from training to bundle: common behaviour, then each method's own."""
 
 import csv
 import dataclasses
@@ -84,7 +84,7 @@ def test_a_finished_run_is_read_back_and_publishes_the_same_bundle(runs, method,
 
 def test_an_interrupted_run_ends_as_if_it_never_was(runs, method, tmp_path):
     _, run, _ = runs(method)
-    # For CQR in the second of its four lessons, for MCQR in the last of its five.
+    # This interrupts CQR in the second of its four lessons, and MCQR in the last of its five.
     calls = {"cqr": 50, "csp": 25, "mcqr": 170}[method]
     with pytest.raises(InterruptedTrainingError):
         train(tmp_path / "run", tiny_config(head=CONFIGS[method]), stopping_after(calls, method))
@@ -94,7 +94,7 @@ def test_an_interrupted_run_ends_as_if_it_never_was(runs, method, tmp_path):
 
 
 def test_a_shared_cache_gives_the_same_features(tmp_path):
-    # Random weights are a run's own: a file of them can be shared.
+    # Runs share features only if their weights come from a file.
     from safetensors.torch import save_file
 
     from cvo_export.networks.backbone import Backbone
@@ -153,7 +153,7 @@ def test_bonferroni_is_recorded_and_is_the_marginal_rule_at_a_sixth(runs, method
         return
     calibration = publish(run, tmp_path / "bundle", "b", joint="bonferroni")
     assert calibration.calibration.joint == "bonferroni"
-    # 64 frames: 1 - 0.1/6 needs rank 64.
+    # With 64 frames, the level 1 - 0.1/6 needs rank 64.
     joint = calibration.threshold(0.9, "joint")
     with Odometer.load(tmp_path / "bundle") as odometer:
         seen = observe(odometer, run.dataset, run.split.roles["cal"])
@@ -354,7 +354,7 @@ def test_contains_is_the_region_in_the_joint_scope_and_six_intervals_in_the_marg
                 else:
                     coordinates = estimate.chart.coordinates(truth, estimate.pose.to_array())
                     assert held == estimate.conformal_set.ellipsoids.contains(coordinates)
-                    # The hull is larger than its region.
+                    # The bounding box is larger than the region.
                     corner = 0.999 * estimate.upper + 0.001 * estimate.lower
                     assert estimate.conformal_set.covers(corner).all()
                     assert not estimate.conformal_set.contains(corner)
@@ -412,7 +412,7 @@ def test_passes_are_rows_of_the_region_and_real_frames_are_what_is_counted(tmp_p
     head = McqrConfig(components=4, rays=8, augmentation="predictions", passes=3)
     run = train(tmp_path / "run", tiny_config(head=head, steps=100, copies=1), ignore_progress)
     frames = run.split.roles["train"].size + run.split.roles["fit"].size
-    # Three passes of each of two copies; val has none.
+    # Training has three passes of each of two copies; val has no passes.
     assert seen == {"mcqr-region": ((3 * 2, frames, 10), (run.split.roles["val"].size, 10))}
     calibration = publish(run, tmp_path / "bundle", "passes")
     assert calibration.calibration.n == run.split.roles["cal"].size
@@ -430,7 +430,7 @@ def test_more_components_than_there_are_is_refused_before_any_lesson(tmp_path, m
 
 
 def test_the_mean_of_many_passes_is_the_network_itself():
-    # Dropout before a linear layer: its expectation is the deterministic answer.
+    # Dropout is before a linear layer, so its expectation is the deterministic output.
     torch.manual_seed(0)
     network = PointNetwork(30, (16, 12), 0.1, dropout=0.3).eval()
     features = torch.randn(5, 30)

@@ -1,4 +1,4 @@
-"""Noise: what each kind does to pixels, and what it does to coverage."""
+"""Noise: its effect on pixels and on coverage."""
 
 import json
 from dataclasses import replace
@@ -66,7 +66,7 @@ def test_a_frame_depends_on_seed_and_number_but_on_no_order(name):
     forward = [worse.read_image(index) for index in range(4)]
     backward = [again.read_image(index) for index in reversed(range(4))][::-1]
     np.testing.assert_array_equal(forward, backward)
-    if name != "exposure":  # which draws nothing
+    if name != "exposure":  # not random
         other = noisy(dataset, parse_noise(name), 4).read_image(0)
         assert not np.array_equal(other, forward[0])
         of_one_image = [
@@ -93,7 +93,7 @@ def test_a_noisy_data_set_has_the_frames_and_splits_of_the_clean_one():
 @pytest.mark.parametrize("strength", [0.02, 0.1])
 def test_gaussian_has_its_deviation_about_the_level(strength):
     image = grey(128)
-    image[0, 0, 0] = 127  # a colour
+    image[0, 0, 0] = 127  # makes the image a colour image
     difference = degraded(f"gaussian:{strength}", image).astype(float) - 128
     assert difference.std() == pytest.approx(255 * strength, rel=0.01)
     assert abs(difference.mean()) < 0.2
@@ -114,14 +114,14 @@ def test_salt_and_pepper_turns_its_share_of_pixels_white_or_black(strength):
     white, black = (found == 255).all(axis=2).mean(), (found == 0).all(axis=2).mean()
     assert white == pytest.approx(strength / 2, abs=0.005)
     assert black == pytest.approx(strength / 2, abs=0.005)
-    # Whole pixels, and no other is touched.
+    # Only whole pixels change; all others stay the same.
     assert white + black + (found == 128).all(axis=2).mean() == pytest.approx(1.0)
 
 
 def test_speckle_is_proportional_to_the_level():
     for level in (20, 60, 120):
         difference = degraded("speckle:0.2", grey(level)).astype(float) - level
-        # A deviation of whole grey levels has 1/12 of a squared level from rounding.
+        # Rounding to whole grey levels adds a variance of 1/12.
         assert difference.std() == pytest.approx(np.hypot(0.2 * level, 12**-0.5), rel=0.02)
         assert abs(difference.mean()) < 0.2
     assert not degraded("speckle:1", grey(0)).any()
@@ -129,7 +129,7 @@ def test_speckle_is_proportional_to_the_level():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_motion_blur_smears_a_point_along_a_line_of_its_length(seed):
-    """A uniform line of length L about the point has the deviation L / sqrt(12) along itself."""
+    """The standard deviation along a uniform line of length L is L / sqrt(12)."""
     image = grey(0, 240, 320)
     image[117:124, 157:164] = 255
     light = degraded("motion-blur:0.1", image, seed)[..., 0].astype(float)
@@ -139,7 +139,7 @@ def test_motion_blur_smears_a_point_along_a_line_of_its_length(seed):
     weights = light.reshape(-1) / light.sum()
     np.testing.assert_allclose(offsets @ weights, 0, atol=0.1)
     across, along = np.linalg.eigvalsh((offsets * weights) @ offsets.T)
-    block = 4.0  # (7^2 - 1) / 12, the square's own variance
+    block = 4.0  # (7^2 - 1) / 12, the variance of the square
     assert np.sqrt(12 * (along - block)) == pytest.approx(32, abs=1.0)
     assert across == pytest.approx(block, abs=0.5)
 
@@ -159,7 +159,7 @@ def test_motion_blur_keeps_brightness_and_takes_every_direction():
 
 
 def linear(coded):
-    """Light (0 to 1) of coded sRGB values, by the standard's own two pieces."""
+    """Decode sRGB values to linear light (0 to 1) with the standard's two-piece curve."""
     coded = np.asarray(coded) / 255
     return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
 
@@ -293,9 +293,9 @@ def test_the_report_says_which_noise_and_its_table_has_both_policies(report):
     json.dumps(report, allow_nan=False)
     lines = table(report)
     assert "noise speckle:0.6 (deviation, share of the pixel's own level), seed 0" in lines
-    clean = lines.index("clean: the bundle's own thresholds, of 64 frames without noise")
+    clean = lines.index("clean: the bundle's own thresholds, from 64 frames without noise")
     again = lines.index(
-        "recalibrated: thresholds of 64 calibration frames with the same noise; left out 0"
+        "recalibrated: thresholds from 64 calibration frames with the same noise; 0 left out"
     )
     for part, footnotes in ((lines[clean:again], 1), (lines[again:], 0)):
         assert sum("marginal" in line for line in part) == 5
@@ -306,7 +306,7 @@ def test_the_report_says_which_noise_and_its_table_has_both_policies(report):
 def test_without_any_strength_both_policies_are_the_clean_evaluation(
     clean_report, tiny_bundle, tiny_run
 ):
-    """Recalibration on the same pixels finds the same thresholds to the last bit."""
+    """Recalibration on the same pixels gives bit-identical thresholds."""
     found = evaluate(tiny_bundle, tiny_run.dataset, "test", noise=Noise("gaussian", 0.0))
     assert found["recalibrated"]["levels"] == clean_report["levels"]
     assert found["sequences"] == clean_report["sequences"]
@@ -318,7 +318,7 @@ def test_without_any_strength_both_policies_are_the_clean_evaluation(
 
 
 def test_frames_that_a_check_flags_are_counted_in_both_roles(tiny_bundle, tiny_run):
-    """An image that cannot be read stays so under noise."""
+    """An image that cannot be read is also invalid under noise."""
     broken = {int(tiny_run.split.roles[role][0]) for role in ("cal", "test")}
     dataset = open_dataset(DATASET)
     read_image = dataset.read_image
@@ -347,7 +347,7 @@ def test_a_split_by_sequence_is_indicative_after_recalibration(tiny_bundle, tmp_
     assert not level["coverage_band_exact"]
     assert "other_rule" not in found
     assert found["recalibrated"]["n_calibration"] == calibration.calibration.n
-    indicative = "? indicative: frames of one recording are no independent draws"
+    indicative = "? indicative: frames of one recording are not independent draws"
     assert table(found).count(indicative) == 1
 
 
@@ -362,8 +362,8 @@ def test_the_command_line_takes_a_noise_and_refuses_it_on_unseen_data(
     with pytest.raises(UsageError) as caught:
         app([*arguments, "--subset", "all"], standalone_mode=False)
     assert str(caught.value) == (
-        "noise: expected --subset test, as unseen data have no calibration frames to be "
-        "recalibrated on, found all"
+        "noise: expected --subset test, whose split has calibration frames to recalibrate "
+        "on, found all"
     )
     with pytest.raises(UsageError, match="NAME one of gaussian"):
         app([*arguments[:-1], "fog"], standalone_mode=False)

@@ -1,4 +1,4 @@
-"""Bundles of another provider: its own thresholds, its own numbers, and nothing in bfloat16."""
+"""Bundles for OpenVINO: thresholds from its own outputs, computed in float32, not in bfloat16."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def images(count: int) -> list[np.ndarray]:
 
 
 def test_thresholds_are_those_of_the_providers_own_numbers(eight, of_openvino, tiny_run):
-    """At any threshold stored, so many calibration frames are inside as the rule says."""
+    """At every stored threshold, the rule gives the number of calibration frames inside."""
     here, there = read_bundle(eight), read_bundle(of_openvino)
     assert here.model_bytes == there.model_bytes
     assert here.calibration.thresholds != there.calibration.thresholds
@@ -81,7 +81,7 @@ def observations(odometer, dataset, indices):
 
 
 def test_float32_is_onnxruntimes_to_five_digits(tiny_run, tiny_bundle, tmp_path):
-    """In bfloat16, which this engine takes where it can, three would be left."""
+    """OpenVINO prefers bfloat16 where available, which would leave three digits."""
     publish(tiny_run, tmp_path / "b", "b", provider="openvino")
     bundle = read_bundle(tmp_path / "b")
     with Odometer(read_bundle(tiny_bundle)) as here, Odometer(bundle) as there:
@@ -135,7 +135,7 @@ def test_without_the_package_one_line_says_what_to_install(of_openvino):
 
 
 def test_a_forest_is_refused_by_its_name():
-    """OpenVINO has no tree ensembles."""
+    """OpenVINO does not support tree ensembles."""
     bundle = read_bundle(ARTIFACTS / "synthetic-room-cqr")
     with pytest.raises(ModelError, match=r"refused by OpenVINO: .*TreeEnsemble") as caught:
         OpenvinoSession(bundle.model_bytes, 1, bundle.calibration.model)
@@ -143,7 +143,7 @@ def test_a_forest_is_refused_by_its_name():
 
 
 def test_a_model_that_reaches_for_another_file_is_refused(bundle, tmp_path, monkeypatch):
-    """By itself this engine would read it, relative to where the process happens to be."""
+    """OpenVINO itself would read the file, relative to the working directory."""
     np.arange(4, dtype=np.float32).tofile(tmp_path / "secret")
     weights = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[4])
     weights.data_location = TensorProto.EXTERNAL

@@ -1,4 +1,4 @@
-"""Options of methods on the command line: from their structs, and refused for other methods."""
+"""Command-line options of methods: taken from their structs, and refused for other methods."""
 
 from typing import Annotated, Literal
 
@@ -33,7 +33,7 @@ def run(*arguments):
 
 
 def text_of(result):
-    """The words of a help page, without its frames and line ends."""
+    """Return the words of a help page, without borders and line ends."""
     return " ".join(result.output.replace("│", " ").split())
 
 
@@ -45,7 +45,7 @@ def test_a_registered_method_is_in_the_help_and_takes_its_options(monkeypatch):
     assert "Options of toy" in text
     assert "Springs of the toy. (>= 1; default: 3)" in text
     assert "wound" in text
-    # Refused by the struct behind the option, so the option arrived there.
+    # The struct behind the option refuses the value, so the option reached it.
     refused = run("train", "toy", "synthetic:room", "unused", "--springs", "0", "--pair", "1", "2")
     assert isinstance(refused.exception, UsageError)
     assert str(refused.exception) == "--springs of toy: expected `int` >= 1, found 0"

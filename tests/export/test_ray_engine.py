@@ -1,4 +1,4 @@
-"""The Ray engine: the same outcomes as processes of this machine, and what a lost worker costs."""
+"""The Ray engine: the same outcomes as local processes, also after losing a worker."""
 
 import os
 import signal
@@ -16,18 +16,18 @@ from cvo_export.study.ray_engine import ray_engine
 
 pytest.importorskip("ray")
 
-# The script beside the interpreter: of this very environment.
+# The script next to the interpreter belongs to the same environment.
 RAY = Path(sys.executable).with_name("ray")
 
 
 @pytest.fixture
 def cluster(monkeypatch):
-    """A cluster of this machine alone, at an address of its own, ended afterwards."""
+    """A cluster on this machine alone, at a free address, stopped after the test."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{found.getsockname()[1]}"
     monkeypatch.setenv("RAY_ADDRESS", address)
-    # Whatever tokens this machine's user has.
+    # Ignore any tokens of this machine's user.
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     options = [f"--port={address.split(':')[1]}", "--node-ip-address=127.0.0.1", "--num-cpus=2"]
     quiet = ["--include-dashboard=false", "--disable-usage-stats"]
@@ -53,7 +53,7 @@ def refuse():
 
 
 def die_once(path):
-    """End this process the hard way the first time, succeed the second."""
+    """Kill this process the first time; succeed the second time."""
     if not path.exists():
         path.write_text("once")
         os.kill(os.getpid(), signal.SIGKILL)
@@ -72,9 +72,9 @@ def test_outcomes_are_those_of_the_tasks_and_a_killed_worker_is_run_again(
     found = {}
     before = signal.getsignal(signal.SIGTERM)
     with ray_engine() as run:
-        # Our programs leave with their own exit codes.
+        # The engine must not replace the handler that sets our exit codes.
         assert signal.getsignal(signal.SIGTERM) == before
-        # Workers were started with this folder's modules, and find them.
+        # Workers still find the modules of the folder in which they were started.
         monkeypatch.chdir(tmp_path)
         run(tasks, found.__setitem__)
     assert set(found) == set(tasks)
@@ -101,7 +101,7 @@ def test_no_address_at_all_is_refused(monkeypatch, tmp_path):
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
     with pytest.raises(UsageError, match="no Ray cluster at any address; start one"), ray_engine():
         raise AssertionError
-    # What a head that was killed leaves.
+    # A killed head node leaves this file behind.
     (tmp_path / "ray").mkdir()
     (tmp_path / "ray" / "ray_current_cluster").write_text("127.0.0.1:9")
     with pytest.raises(UsageError, match=r"no Ray cluster at 127.0.0.1:9;"), ray_engine():
@@ -132,5 +132,5 @@ def test_a_token_is_used_where_ray_start_uses_it(
     with pytest.raises(UsageError, match="no Ray cluster"), ray_engine():
         raise AssertionError
     assert os.environ.get("RAY_AUTH_MODE") == expected
-    # Set by us: not undone by the patch where it was not there before.
+    # The engine sets this variable, so monkeypatch does not remove it.
     os.environ.pop("RAY_AUTH_MODE", None)

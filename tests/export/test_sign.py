@@ -1,4 +1,4 @@
-"""Signatures: what a device takes, and what it refuses, through both command lines."""
+"""Signatures: which bundles a device accepts or refuses, through both command lines."""
 
 import json
 import shutil
@@ -21,13 +21,13 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
 @pytest.fixture(autouse=True)
 def state(tmp_path, monkeypatch):
-    """A device that has not run anything yet."""
+    """The state file of a device that has not run any bundle."""
     monkeypatch.setenv("CVO_EDGE_STATE", str(tmp_path / "state"))
     return tmp_path / "state" / "versions.json"
 
 
 def key_pair(folder, name, passphrase=None, private=None):
-    """PEM files of a new key."""
+    """Write a new key pair and return its PEM files."""
     private = private or ed25519.Ed25519PrivateKey.generate()
     encryption = (
         serialization.BestAvailableEncryption(passphrase)
@@ -63,7 +63,7 @@ def test_a_signed_bundle_is_taken_and_its_version_remembered(copied_bundle, keys
     load(copied_bundle, public)
     assert json.loads(state.read_text()) == {signature.key: {signature.name: 7}}
     assert verify_bundle(copied_bundle, threads=1, public_key=public).name == signature.name
-    # Without a key nobody asks.
+    # Without a public key, signatures are not checked.
     Odometer.load(copied_bundle, threads=1).close()
 
 
@@ -79,7 +79,7 @@ def test_a_signature_with_another_key_is_refused(copied_bundle, keys, tmp_path):
     sign(copied_bundle, foreign)
     with pytest.raises(BundleMismatchError, match="expected a signature with the key"):
         load(copied_bundle, keys[1])
-    # Nor does it help to say it is ours.
+    # Stating the right key does not help either.
     path = copied_bundle / SIGNATURE_FILE
     ours = sign(copied_bundle, keys[0]).key
     sign(copied_bundle, foreign)
@@ -113,7 +113,7 @@ def test_every_altered_key_of_a_signature_is_refused(copied_bundle, keys):
 
 
 def test_no_flipped_bit_of_a_signature_file_is_taken_for_another_claim(copied_bundle, keys):
-    """Each is refused, or says the very same (a changed space, a digit's other case)."""
+    """Every changed file is refused, unless it parses to the same content."""
     secret, public = keys
     sign(copied_bundle, secret, 7)
     path = copied_bundle / SIGNATURE_FILE
@@ -155,7 +155,7 @@ def test_an_older_version_is_refused_once_a_newer_one_has_run(copied_bundle, key
             refused(copied_bundle, public)
     sign(copied_bundle, secret, 9)
     load(copied_bundle, public)
-    # To look at a newer one is not to run it.
+    # Verifying a newer bundle does not count as running it.
     sign(copied_bundle, secret, 10)
     verify_bundle(copied_bundle, threads=1, public_key=public)
     sign(copied_bundle, secret, 9)
@@ -191,7 +191,7 @@ def test_processes_at_once_keep_the_highest(tmp_path):
     names = ["a", "b", "c", "d"]
     processes = [subprocess.Popen([sys.executable, "-c", code, path, name]) for name in names]
     assert [process.wait() for process in processes] == [0] * 4
-    # Whoever read before another wrote would have put its own in place of all.
+    # Without a lock, a process would overwrite entries written after it had read the file.
     assert [Versions(path).highest("k", name) for name in (*names, "of all")] == [99] * 5
     assert [p.name for p in path.parent.iterdir() if p.suffix not in (".json", ".lock")] == []
 
@@ -212,7 +212,7 @@ def test_what_is_no_ed25519_public_key_is_refused(copied_bundle, keys, tmp_path,
 
 def test_a_private_key_may_be_encrypted(copied_bundle, tmp_path, monkeypatch):
     secret, public = key_pair(tmp_path, "ours", b"open sesame")
-    with pytest.raises(UsageError, match=PASSPHRASE):
+    with pytest.raises(UsageError, match=f"the key is encrypted; set {PASSPHRASE}"):
         sign(copied_bundle, secret)
     monkeypatch.setenv(PASSPHRASE, "wrong")
     with pytest.raises(UsageError, match="passphrase"):
@@ -266,7 +266,7 @@ def test_what_lies_where_a_signature_is_written_is_not_followed(copied_bundle, k
     victim.write_text("precious")
     (copied_bundle / SIGNATURE_FILE).symlink_to(victim)
     (copied_bundle / f"{SIGNATURE_FILE}.00000000.partial").symlink_to(victim)
-    # The very name that is drawn.
+    # Fix the random part of the temporary file's name, so that the link is in its place.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("cvo_edge.files.os.urandom", bytes)
         with pytest.raises(SinkError):

@@ -1,4 +1,4 @@
-"""A study: every cell once, the same wherever its files are, and a page that needs no other."""
+"""A study: each cell runs once, files may be moved, and the page is self-contained."""
 
 import fcntl
 import json
@@ -47,7 +47,7 @@ vary = {{ sharpness = [0.5, 1.0] }}
 
 @pytest.fixture(scope="module")
 def studied(tmp_path_factory):
-    """Folder, results and page of a study, and what was said of its cells."""
+    """Folder, study, results, page and messages of a study."""
     folder = tmp_path_factory.mktemp("study")
     (folder / "study.toml").write_text(CONFIG)
     said = []
@@ -66,8 +66,8 @@ def engine(tasks, ended):
 
 def test_a_cell_of_two_grids_is_run_once(studied):
     folder, _, results, _, said = studied
-    # Sharpness 0.5 is what seed 0 of the first grid has anyway.
-    assert len(said) == 1 + 3  # the data set, and each cell
+    # Sharpness 0.5 is the default, so this cell is seed 0 of the first grid.
+    assert len(said) == 1 + 3  # one for the data set and one per cell
     assert len(results.cells) == len(list((folder.out / "cells").iterdir())) == 3
     assert len(results.places) == 4
     first, _, default, other = results.places
@@ -140,7 +140,7 @@ def test_fine_tuning_is_part_of_the_training_time(monkeypatch):
     monkeypatch.setattr(cells, "perf_counter", lambda: 0.0)
     clock = cells._Clock()
     clock("features", 2, 2)
-    # Features of the backbone as it has learnt.
+    # Features of the fine-tuned backbone.
     clock("features", 2, 2)
     assert clock.seconds().processor == 25.0 - 10.0
 
@@ -255,7 +255,7 @@ def test_two_data_sets_of_one_name_are_told_apart(monkeypatch, tmp_path):
 
 
 def planned(text, folder, monkeypatch):
-    """The plan of a study that has not been run."""
+    """The plan of a study that has not run."""
     monkeypatch.setenv("CVO_TEST_DATA", DATASET)
     (folder / "study.toml").write_text(text)
     return plan_study(read_study(folder / "study.toml"))
@@ -299,7 +299,7 @@ def test_a_share_of_the_training_frames_is_a_part_of_a_larger_one(kind):
 
 @pytest.mark.parametrize(("name", "cells"), [("small", 10), ("full", 62)])
 def test_the_configurations_that_come_with_the_project_can_be(name, cells, request, monkeypatch):
-    """On any data with as many sequences: methods, options, noises and names are good ones."""
+    """Methods, options, noises and names are valid for data with as many sequences."""
     monkeypatch.setenv("CVO_DATA", "of-another-place")
     monkeypatch.setenv("CVO_WEIGHTS", "of-another-place")
     study = read_study(request.config.rootpath / "bench" / "study" / f"{name}.toml")

@@ -1,4 +1,4 @@
-"""The page of a study: each figure stands where it is said to stand."""
+"""The page of a study: each figure is in its row and column."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def cell(method: str, seed: int, score: float, own: float | None = None, **noise
 
 
 class Fabricated:
-    """Results whose cells are made up: a score for each place."""
+    """Study results with made-up cells: one score per place."""
 
     def __init__(self, methods=("cjp", "csp")) -> None:
         self.methods = methods
@@ -66,7 +66,7 @@ class Fabricated:
         self.cells: dict[str, Cell] = {}
 
     def add(self, name, made, *, split="random", backbones=("net",), vary=None, **options):
-        """Add a grid; ``made`` says what the cell of a place is."""
+        """Add a grid; ``made`` returns the cell of a place."""
         vary = vary or {}
         grid = Grid(
             name=name,
@@ -128,7 +128,7 @@ def test_noise_of_another_grid_is_not_shown_and_refused_frames_are():
             p.method,
             p.seed,
             1.0,
-            # The other grid's cells are some of this one's.
+            # This grid contains the cells of the other grid.
             **({"speckle:0.3": noise} if p.seed else seen),
             **{"exposure:-8.0": None},
         ),
@@ -140,7 +140,7 @@ def test_noise_of_another_grid_is_not_shown_and_refused_frames_are():
     assert names == ["none", "speckle:0.3", "exposure:-8.0"] * 2
     row = dict(zip(table.head, table.rows[1], strict=True))
     assert row["invalid"] == "10.0 %"
-    # Both policies have a score: the last of that name is the recalibrated one's.
+    # Both policies have a score column; the last one is the recalibrated policy's.
     assert [value for value in table.rows[1] if value.startswith(("5", "6"))] == [
         "5.000 (5.000, 5.000)",
         "6.000 (6.000, 6.000)",
@@ -244,7 +244,7 @@ def test_lines_of_a_curve_are_of_one_backbone_and_one_of_all_else():
 def test_adaptiveness_is_what_its_names_say():
     error = np.tile(np.arange(9.0)[:, np.newaxis], (1, 6))
     found = adaptiveness(1.0 + error, error)
-    # (7 + 8 + 9) over (1 + 2 + 3).
+    # The ratio is (7 + 8 + 9) / (1 + 2 + 3).
     assert found == {"width_ratio": pytest.approx(4.0), "rank_correlation": pytest.approx(1.0)}
     backwards = adaptiveness(9.0 - error, error)
     assert backwards == {

@@ -1,6 +1,6 @@
-"""A new method is two files: one that nobody else knows goes through every command.
+"""A new method needs two files: a toy method works with every command.
 
-``toy_head`` and ``toy_network`` are registered with a line each, as a method of the project is.
+``toy_head`` and ``toy_network`` are registered with one line each, like the project's methods.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Training: reproducible, resumable to the bit, and refusing what is another run's."""
+"""Training: reproducible, bit-identical after resuming, and never mixing two runs."""
 
 import shutil
 

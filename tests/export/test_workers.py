@@ -1,4 +1,4 @@
-"""Tasks in processes: all are tried, a failure keeps its kind, none is left behind."""
+"""Tasks in processes: every task runs, failures keep their type, and no process is left behind."""
 
 import os
 import signal
@@ -35,7 +35,7 @@ def test_a_failure_keeps_its_kind_and_the_other_tasks_run(tmp_path, jobs, capfd)
     assert isinstance(found["defect"], TaskError)
     assert str(found["defect"]).startswith("ValueError: invalid literal")
     assert all("\n" not in str(error) for error in found.values())
-    # A defect's place is worth more than a line.
+    # A programming error also needs its traceback, not just one line.
     assert "Traceback" in capfd.readouterr().err
 
 
@@ -71,7 +71,7 @@ def test_no_process_is_left_behind_by_a_signal(tmp_path, number):
     )
     code = (
         "import signal, sys; from functools import partial\n"
-        # What starts the tests may have it ignored.
+        # The process that starts the tests may ignore SIGINT, which children inherit.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from cvo_export.study.workers import run_tasks\n"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))\n"

@@ -1,4 +1,4 @@
-"""The runtime's side of a toy method: half-widths in fixed units, one factor for all frames."""
+"""Runtime side of a toy method: fixed half-widths, scaled by one factor for all frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cvo_edge.vocabulary import Scope
 
 
 class ToyParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """``unit``: per DoF (m, rad) what a score of one is."""
+    """``unit`` is the error per DoF (m, rad) that has a score of 1."""
 
     unit: SixPositive
 
@@ -28,7 +28,7 @@ class ToyHead(Head):
     method = "toy"
     parameters_type = ToyParameters
     score_names = ("toy_distance",)
-    outputs = {"pose": (1, 7)}  # noqa: RUF012 - as the protocol has it
+    outputs = {"pose": (1, 7)}  # noqa: RUF012 - declared like this in the protocol
 
     def scores(
         self,

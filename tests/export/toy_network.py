@@ -1,4 +1,4 @@
-"""The training side of a toy method: a linear network that gives a pose and nothing else."""
+"""Training side of a toy method: a linear network whose only output is a pose."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .toy_head import ToyParameters
 
 
 class ToyConfig(Struct, frozen=True, tag="toy", tag_field="method", forbid_unknown_fields=True):
-    """The one choice of the toy."""
+    """The toy's only option."""
 
     toy_noise: Annotated[
         float, Meta(ge=0, le=10, description="Noise on the features while training.")
@@ -36,7 +36,7 @@ class ToyConfig(Struct, frozen=True, tag="toy", tag_field="method", forbid_unkno
 
 
 class ToyLearner(Learner):
-    """One linear layer with the mean absolute error."""
+    """One linear layer, trained with the mean absolute error."""
 
     def __init__(self, size: int, config: ToyConfig) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ class ToyLearner(Learner):
 
 
 class ToyExport(ExportedHead):
-    """Features -> pose (n, 7)."""
+    """Maps features to poses (n, 7)."""
 
     output_names = ("pose",)
     runtime_method = "toy"

@@ -1,4 +1,4 @@
-"""Coverage by simulation: the mean over many calibrations against k/(n+1)."""
+"""Simulated coverage: the mean over many calibrations against k/(n+1)."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def test_marginal_coverage_is_rank_over_n_plus_one(n, confidence):
     covered = []
     for _ in range(REPEATS):
         q_hat = conformal_quantile(generator.random(n), confidence)
-        covered.append(min(q_hat, 1.0))  # the exact coverage for uniform scores
+        covered.append(min(q_hat, 1.0))  # exact coverage for uniform scores
     expected = min(1.0, conformal_rank(n, confidence) / (n + 1))
     error = np.std(covered) / np.sqrt(REPEATS) + 1e-12
     assert abs(np.mean(covered) - expected) < 4.5 * error
@@ -40,7 +40,7 @@ def test_joint_coverage_of_correlated_scores_is_rank_over_n_plus_one(n):
         thresholds = scale.thresholds(conformal_quantile(largest, confidence))
         hits += int((scores[n:] <= thresholds).all(axis=(1, 2)).sum())
     k = conformal_rank(n, confidence)
-    # Beta(k, n + 1 - k) between calibrations, binomial within one.
+    # Coverage is Beta(k, n + 1 - k) between calibrations and binomial within one calibration.
     mean = k / (n + 1)
     beta_variance = mean * (1 - mean) / (n + 2)
     error = np.sqrt((beta_variance + mean * (1 - mean) / trials) / REPEATS)
@@ -48,7 +48,7 @@ def test_joint_coverage_of_correlated_scores_is_rank_over_n_plus_one(n):
 
 
 def test_hierarchical_rule_covers_new_sequences_where_pooling_does_not():
-    # Eleven sequences, each with a difficulty of its own; a new one is drawn each time.
+    # Eleven calibration sequences of different difficulty, and a new sequence for the test.
     generator = np.random.default_rng(5)
     pooled, hierarchical = [], []
     for _ in range(REPEATS):
@@ -62,10 +62,10 @@ def test_hierarchical_rule_covers_new_sequences_where_pooling_does_not():
     assert np.mean(pooled) < 0.89
 
 
-# -- through the heads: calibrated and judged as bundles are --------------------------------------
+# -- through the heads: calibrated and evaluated like bundles -------------------------------------
 
 TRIALS = 20
-# Building a set takes longer than a score: so many of a repeat's trials are judged as sets.
+# Trials per repeat that are evaluated as sets, because building a set is slower than a score.
 JUDGED = 4
 CONFIDENCE = 0.9
 FLOOR = [0.01] * 6
@@ -88,7 +88,7 @@ SCATTER = np.random.default_rng(0).standard_normal((8, 6))
 
 
 def frames(count, seed):
-    """Outputs, points and truths (count, 6) of a model whose uncertainty is right on average."""
+    """Outputs, points and truths (count, 6) of a model with roughly correct uncertainty."""
     generator = np.random.default_rng(seed)
     point = generator.standard_normal((count, 6))
     spread = 0.1 + 0.5 * generator.random((count, 6))
@@ -96,7 +96,7 @@ def frames(count, seed):
     edges = np.array(CLASSES["edges"][0])
     middle = 0.5 * (edges[1:] + edges[:-1])
     logits = -0.5 * ((middle - point[..., None]) / (1.3 * spread[..., None])) ** 2
-    # Noise, so that ranks differ from distances and no two scores are the same.
+    # Noise makes class ranks differ from distances and all scores distinct.
     p = np.exp(logits + 0.7 * generator.standard_normal(logits.shape))
     scale = np.zeros((count, 6, 6), np.float32)
     scale[:, range(6), range(6)] = spread * generator.uniform(0.5, 1.5, (count, 6))
@@ -112,7 +112,7 @@ def frames(count, seed):
 
 
 def standard_error(mean, n, columns=6, trials=TRIALS):
-    """Of the mean coverage: Beta between calibrations, binomial within one."""
+    """Standard error of the mean coverage: Beta between calibrations, binomial within one."""
     variance = mean * (1 - mean) * (1 / (n + 2) + 1 / trials)
     return np.sqrt(variance / (REPEATS * columns))
 
@@ -130,7 +130,7 @@ def test_scores_are_at_most_the_threshold_in_rank_over_n_plus_one(
         for repeat in scores
     ]
     expected = conformal_rank(n, CONFIDENCE) / (n + 1)
-    # Two-sided: neither too little nor too much.
+    # The check is two-sided: over-coverage fails too.
     assert abs(np.mean(covered) - expected) < 4.5 * standard_error(expected, n)
 
 
@@ -140,7 +140,7 @@ def scored(head, outputs, point, truth):
 
 
 def coverages(head, n, joint="max"):
-    """Per DoF and jointly: (marginal sets, their hulls, joint sets), means over all repeats."""
+    """Return the mean coverage of marginal sets and their hulls, per DoF, and of joint sets."""
     outputs, point, truth = frames(REPEATS * (n + TRIALS) + 200, n)
     every = scored(head, outputs, point, truth)
     val = Scored(*(values[-200:] for values in every))
@@ -186,7 +186,7 @@ def test_bonferroni_holds_jointly_or_says_that_it_cannot(make_head, method, scor
     head = make_head(method, score, parameters)
     _, _, jointly = coverages(head, n, "bonferroni")
     assert jointly > CONFIDENCE - 4.5 * standard_error(CONFIDENCE, n, columns=1, trials=JUDGED)
-    # A sixth of the miscoverage needs 59 frames.
+    # A finite threshold at a sixth of the miscoverage needs 59 frames.
     assert bool(jointly == 1.0) is (n < 59)
 
 

@@ -1,4 +1,4 @@
-"""Thresholds and sets against independent implementations: MAPIE, crepes, and plain numpy."""
+"""Thresholds and sets against independent implementations: MAPIE, crepes and plain numpy."""
 
 import math
 import warnings
@@ -18,7 +18,7 @@ LEVELS = [0.5, 0.8, 0.9, 0.95]
 
 
 class Column:
-    """A fitted regressor in scikit-learn's sense: predicts one column of its input."""
+    """A fitted scikit-learn regressor that predicts one column of its input."""
 
     is_fitted = True
 
@@ -36,7 +36,7 @@ class Column:
 
 
 def intervals(n, seed=0):
-    """Bounds (n,) about random points, and truths that are outside now and then."""
+    """Random bounds, points and truths, (n,) each; some truths lie outside their bounds."""
     generator = np.random.default_rng((seed, n))
     middle = generator.standard_normal(n)
     half = 0.2 + generator.random(n)
@@ -44,7 +44,7 @@ def intervals(n, seed=0):
 
 
 def sides(lower, upper, point, truth):
-    """Additive scores below and above, (n,) each, as the runtime computes them."""
+    """Return the runtime's additive scores for the lower and the upper bound, (n,) each."""
     columns = (np.tile(values[:, np.newaxis], 6) for values in (lower, upper, point, truth))
     return IntervalScore(None).sides(*columns)[..., 0].T
 
@@ -56,7 +56,7 @@ def mapie_intervals(n, confidence, symmetric):
         [Column(0), Column(1), Column(2)], confidence_level=confidence, prefit=True
     ).conformalize(x, truth)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of crossing bounds
+        warnings.simplefilter("ignore")  # about crossing bounds
         _, found = regressor.predict_interval(x, symmetric_correction=symmetric)
     return found[:, :, 0]
 
@@ -102,19 +102,19 @@ def test_symmetric_thresholds_are_those_of_crepes_but_where_its_index_is_rounded
     for n in range(10, 301):
         scores = np.abs(np.maximum(*sides(*intervals(n))))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of too few examples
+            warnings.simplefilter("ignore")  # about too few examples
             found = ConformalRegressor().fit(scores).predict_int(np.zeros(1), confidence=confidence)
         expected = conformal_quantile(scores, confidence)
         if found[0, 1] == expected:
             continue
         differing.add(n)
-        # One rank higher: valid, a little wider.
+        # crepes uses one rank more, which is valid but slightly wider.
         k = conformal_rank(n, confidence)
         assert found[0, 1] == (np.sort(scores)[k] if k < n else math.inf)
     assert differing == ROUNDED_BY_CREPES[confidence]
 
 
-# Where (1 - confidence) * (n + 1) is whole in mathematics and a little less in floating point.
+# Sizes n for which (1 - confidence) * (n + 1) is whole but slightly less in floating point.
 ROUNDED_BY_CREPES: dict[float, set[int]] = {
     0.5: set(),
     0.8: set(range(14, 301, 5)),
@@ -124,7 +124,7 @@ ROUNDED_BY_CREPES: dict[float, set[int]] = {
 
 
 def plain_score(p, y, score, penalty, free):
-    """The score of class y by the definitions, one number at a time."""
+    """Compute the score of class y from its definition, one number at a time."""
     if score == "lac":
         return 1.0 - p[y]
     ranked = sorted(range(len(p)), key=lambda k: (-p[k], k))
@@ -137,7 +137,7 @@ def plain_score(p, y, score, penalty, free):
 def test_class_scores_are_their_definition(score):
     generator = np.random.default_rng(1)
     p = generator.dirichlet(np.full(12, 0.3), size=(30, 6))
-    p[0] = 1 / 12  # all equal: ranks by the class's number
+    p[0] = 1 / 12  # ties are ranked by class number
     found = class_scores(p, score, 0.1, 2)
     for frame in range(30):
         for dof in range(6):
