@@ -1,1 +1,1 @@
-"""The runtime on other processors: emulated boards, and a comparison with this machine."""
+"""Test the runtime on emulated processors and compare its results with this machine."""

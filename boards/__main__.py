@@ -1,8 +1,8 @@
-"""The runtime on an emulated board, held against this machine: ``python -m boards arm64``.
+"""Compare the runtime on an emulated board with this machine: ``python -m boards arm64``.
 
-Runs the runtime's tests and every bundle's self-test on the board, then every bundle over the same
-test frames on both, and compares record by record. Exits with 1 where a test or a self-test fails
-or a difference is beyond its tolerance, with 2 where the board cannot be set up.
+Runs the runtime's tests and every bundle's self-test on the board. Then runs every bundle over the
+same test frames on both and compares the records. Exits with 1 if a test or a self-test fails or a
+difference exceeds its tolerance, and with 2 if the board cannot be set up.
 """
 
 from __future__ import annotations
@@ -46,28 +46,28 @@ from cvo_edge.pose import Chart
 
 CONFIDENCE = 0.9
 
-# Of the tests those that an emulated processor is too slow for.
+# Markers of tests that are too slow on an emulated processor.
 MARKS = "whole_clip or clock"
 
-# In the joint scope sets differ from the others in their thresholds alone: the first fifth of the
-# frames will do, as an emulated inference takes a second.
+# Joint sets differ from marginal sets only in their thresholds. A fifth of the frames is enough for
+# them, because an emulated inference takes a second.
 JOINT_SHARE = 5
-# Saturated products put positions off by centimetres, rounding by less than a micrometre.
+# Saturated products move positions by centimetres, rounding by less than a micrometre.
 CONTROL_FRAMES = 5
 LEAST_SATURATION_M = 1e-3
 
-# Their sets move by whole classes.
+# Methods whose sets change by whole classes.
 STEPWISE = ("csp",)
 
 _RUNTIME = ("-c", "from cvo_edge.__main__ import main; main()")
 
 
 def main() -> int:
-    """Run all of it and print the tables -> the exit code."""
+    """Run everything, print the tables and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m boards")
     parser.add_argument("board", choices=BOARDS)
     parser.add_argument(
-        "--bundles", nargs="+", type=Path, default=demonstrations(), help="the repository's own"
+        "--bundles", nargs="+", type=Path, default=demonstrations(), help="default: all"
     )
     parser.add_argument(
         "--frames-per-flight", type=int, choices=range(1, 51), default=5, metavar="N"
@@ -108,21 +108,21 @@ def main() -> int:
     failures = [f"{r['name']}: {line}" for r in reports for line in r["failures"]]
     if tests["failed"]:
         failures.insert(0, f"tests: {tests['failed']} failed")
-    print(*failures or [f"{board.name} computes what {platform.machine()} does"], sep="\n")
+    print(*failures or [f"{board.name} agrees with {platform.machine()}"], sep="\n")
     return 1 if failures else 0
 
 
 def demonstrations() -> list[Path]:
-    """Folders of the repository's own bundles."""
+    """Return the folders of the bundles in the repository."""
     files = sorted((ROOT / "calibration_artifacts").glob(f"*/{CALIBRATION_FILE}"))
     return [file.parent for file in files]
 
 
 def run_tests(board: Board, python: Path) -> dict[str, int]:
-    """Run the runtime's tests on the board, seen as they run -> how many had which outcome."""
+    """Run the runtime's tests on the board, with their output, and return counts by outcome."""
     report = FOLDER / f"{board.name}-tests.xml"
     report.unlink(missing_ok=True)
-    print(f"tests: {', '.join(board.tests)}; left out: those marked {MARKS}", flush=True)
+    print(f"tests: {', '.join(board.tests)}; without those marked {MARKS}", flush=True)
     marks = ("-m", f"not ({MARKS})", f"--junitxml={report}")
     parallel = ("-n", str(allowed_cores()), "--dist=load")
     command: list[str | Path] = [python, "-m", "pytest", "-q"]
@@ -132,7 +132,7 @@ def run_tests(board: Board, python: Path) -> dict[str, int]:
         return {"passed": 0, "skipped": 0, "failed": 1}
     suite = next(ElementTree.parse(report).iter("testsuite"))
     counts = {name: int(suite.get(name, 0)) for name in ("tests", "skipped", "failures", "errors")}
-    # pytest itself may fail, with every test passed.
+    # pytest itself may fail although every test passed.
     failed = counts["failures"] + counts["errors"] or int(code != 0)
     passed = counts["tests"] - counts["skipped"] - counts["failures"] - counts["errors"]
     return {"passed": passed, "skipped": counts["skipped"], "failed": failed}
@@ -141,7 +141,7 @@ def run_tests(board: Board, python: Path) -> dict[str, int]:
 def examine(
     board: Board, python: Path, frames: Path, folder: Path, calibration: Calibration
 ) -> dict[str, Any]:
-    """Self-test, records and their comparison, of one bundle -> its figures, with failures."""
+    """Run one bundle's self-test and compare its records; returns its figures and failures."""
     name, precision = calibration.name, calibration.model.precision
     tolerance, stepwise = TOLERANCES[precision], calibration.method in STEPWISE
     failures = []
@@ -178,9 +178,10 @@ def examine(
 
 
 def saturation(python: Path, folder: Path, frames: Path) -> dict[str, float]:
-    """Largest error of the position with and without onnxruntime's option, against this machine.
+    """Return the largest position error, against this machine, with and without the option.
 
-    A control: where nothing saturates without it, no processor without VNNI was tried.
+    This is a control: if nothing saturates without onnxruntime's option, the emulated processor
+    does not behave like one without VNNI.
     """
     script = (ROOT / "boards" / "saturation.py", folder, frames, str(CONTROL_FRAMES))
     here, there = (
@@ -194,10 +195,10 @@ def saturation(python: Path, folder: Path, frames: Path) -> dict[str, float]:
 
 
 def software(python: Path) -> dict[str, Any]:
-    """Versions and processor of a Python's machine, as its ``cvo-edge doctor`` tells them."""
+    """Return versions and processor as reported by ``cvo-edge doctor`` under this Python."""
     report = json.loads(_output(python, *_RUNTIME, "doctor", "--json"))
     versions = {name: text for name, text in report["versions"].items() if name != "cvo-edge"}
-    # An emulated x86 reads this machine's /proc/cpuinfo; what numpy finds it asks the processor.
+    # An emulated x86 reads this machine's /proc/cpuinfo, but numpy queries the processor itself.
     find = "import numpy; print(*numpy.show_config('dicts')['SIMD Extensions'].get('found', ()))"
     return {
         "architecture": report["architecture"],
@@ -207,7 +208,7 @@ def software(python: Path) -> dict[str, Any]:
 
 
 def print_tables(reports: list[dict[str, Any]]) -> None:
-    """Print differences, coverage and, where there is one, the control."""
+    """Print differences, coverage and the control, if there is one."""
     rows = [
         (report["name"], scope, each)
         for report in reports
@@ -236,7 +237,7 @@ def _records(
 ) -> Records:
     output = FOLDER / f"{name}.jsonl"
     output.unlink(missing_ok=True)
-    # A cache entry is told by /proc/cpuinfo, which an emulated x86 shares with this machine.
+    # Cache keys use /proc/cpuinfo, which an emulated x86 shares with this machine.
     how = (f"--confidence={CONFIDENCE}", "--threads=1", "--no-cache", "--quiet")
     _output(python, *_RUNTIME, "run", folder, frames, *options, *how, f"--output={output}")
     return stacked(read_records(output))
@@ -268,9 +269,9 @@ def _call(python: Path, *arguments: str | Path) -> subprocess.CompletedProcess[s
 
 
 def _environment() -> dict[str, str]:
-    """As it is here, but that only the project's own code is found besides a Python's packages.
+    """Return this process's environment with the project as the only entry of PYTHONPATH.
 
-    Nor models that this machine has prepared: an emulated processor is known by its flags.
+    The model cache is separate, because its entries depend on the processor's flags.
     """
     own = {"PYTHONPATH": str(ROOT), "CVO_EDGE_CACHE": str(FOLDER / "models")}
     return {**os.environ, **own}

@@ -1,4 +1,4 @@
-"""Records of one bundle from two processors: how far apart they are, and what they cover."""
+"""Compare one bundle's records from two processors: differences and coverage."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Records:
     Attributes
     ----------
     sources, statuses
-        n names of frames, and what was said of each.
+        Name and status of each of the n frames.
     poses
         Shape (n, 7), m and unit quaternion; NaN where invalid.
     sets
-        n conformal sets: m and rad in the bundle's chart.
+        n conformal sets, m and rad, in the bundle's chart.
     """
 
     sources: tuple[str, ...]
@@ -90,24 +90,24 @@ def _end(value: float | None, unbounded: float) -> float:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far the numbers of two processors may be apart.
+    """Largest differences allowed between two processors.
 
     Attributes
     ----------
     share
-        Of position, rotation and bounds, in units of the mean width of the intervals.
+        Difference of position, rotation and bounds, in units of the mean interval width.
     moved_share
-        Of the sets of a stepwise method: how many may differ by more, as a class whose
-        probability is at the threshold enters or leaves a set as a whole.
+        Share of a stepwise method's sets that may differ by more, because a class with a
+        probability close to the threshold enters or leaves a set as a whole.
     """
 
     share: float
     moved_share: float
 
 
-# By precision. fp32: kernels sum in another order. int8: where
-# that turns a rounding, a feature is off by 1/255 of its map's range, which moved the bounds of the
-# demonstration bundles by 6 % of a width, and a hundredth of the sets of CSP by more.
+# By precision. fp32: kernels sum in a different order. int8: if that changes a rounding, a feature
+# differs by 1/255 of its map's range. This moved the bounds of the demonstration bundles by 6 % of
+# a width, and one in a hundred sets of CSP by more.
 TOLERANCES = {"fp32": Tolerance(5e-4, 0.002), "int8": Tolerance(0.1, 0.1)}
 
 
@@ -118,19 +118,19 @@ class Difference:
     Attributes
     ----------
     frames, statuses
-        Number of frames, and of those with another status.
+        Number of frames, and number of frames with different statuses.
     position_m, rotation_rad
-        Distance of the positions, angle between the rotations.
+        Distance between the positions and angle between the rotations.
     position_share, rotation_share
-        The same over the mean width of the three intervals.
+        Both over the mean width of the three intervals.
     bound_m, bound_rad
-        Of the lower and upper bounds; infinite where only one of the two is bounded.
+        Difference of the bounds; infinite if only one of the two is bounded.
     bound_share
-        Of the bounds, over the mean width of their degree of freedom.
+        Difference of the bounds over the mean width of their degree of freedom.
     bands
-        Number of sets (frames times six) with another number of pieces.
+        Number of sets (six per frame) with a different number of bands.
     moved
-        Number of sets with another number of pieces, or a bound beyond the tolerance.
+        Number of sets with a different number of bands, or a bound beyond the tolerance.
     """
 
     frames: int
@@ -147,14 +147,14 @@ class Difference:
 
 
 def difference(first: Records, second: Records, tolerance: Tolerance) -> Difference:
-    """Compare two runs, widths being those of the first; raises ValueError on other frames."""
+    """Compare two runs, in widths of the first; raises ValueError if their frames differ."""
     if first.sources != second.sources:
         raise ValueError("expected records of the same frames in the same order")
     position = _largest(np.linalg.norm(_gap(first.poses, second.poses)[:, :3], axis=1))
     rotation = _largest(_angles(first.poses, second.poses))
     bounds = np.maximum(_gap(first.lower, second.lower), _gap(first.upper, second.upper))
     width = mean_width(first)
-    # What is unbounded on both has no width, and no difference.
+    # Sets that are unbounded in both runs have no width and no difference.
     shares = np.divide(bounds, width, out=np.zeros_like(bounds), where=bounds > 0.0)
     other_bands = first.bands != second.bands
     return Difference(
@@ -173,19 +173,19 @@ def difference(first: Records, second: Records, tolerance: Tolerance) -> Differe
 
 
 def exceeded(found: Difference, tolerance: Tolerance, *, stepwise: bool) -> list[str]:
-    """What is beyond the tolerance, a line each; ``stepwise`` where sets move in steps."""
+    """Return one line per exceeded tolerance; ``stepwise`` for methods whose sets move in steps."""
     shares = {"position": found.position_share, "rotation": found.rotation_share}
-    # No step leads from a bound to none.
+    # Steps do not explain a bound that becomes infinite.
     if not stepwise or math.isinf(found.bound_share):
         shares["bounds"] = found.bound_share
-    # Written so that NaN is beyond it.
+    # Written so that NaN exceeds the tolerance.
     complaints = [
         f"{name}: expected at most {tolerance.share:g} of the mean width, found {share:.3g}"
         for name, share in shares.items()
         if not share <= tolerance.share
     ]
     if found.statuses:
-        complaints.append(f"status: expected the same, found {found.statuses} frames with another")
+        complaints.append(f"status: expected equal statuses, found {found.statuses} that differ")
     allowed = tolerance.moved_share * 6 * found.frames if stepwise else 0
     if found.moved > allowed:
         complaints.append(f"sets: expected at most {allowed:g} moved, found {found.moved}")
@@ -193,7 +193,7 @@ def exceeded(found: Difference, tolerance: Tolerance, *, stepwise: bool) -> list
 
 
 def mean_width(records: Records) -> Array:
-    """Shape (6,): mean width of the bounded sets, gaps left out; NaN where there is none."""
+    """Return the mean width of bounded sets, without gaps, (6,); NaN if all are unbounded."""
     widths = np.array([each.width() for each in records.sets])
     bounded = np.isfinite(widths)
     with np.errstate(invalid="ignore"):
@@ -201,9 +201,10 @@ def mean_width(records: Records) -> Array:
 
 
 def coverage(records: Records, chart: Chart, truth: Mapping[str, Array]) -> dict[str, Any]:
-    """Share of the frames whose set holds the true pose: per degree of freedom, and all six.
+    """Return the share of frames whose set contains the true pose, per DoF and for all six.
 
-    ``truth`` gives true poses (7,) by source; frames without one, or without a pose, do not count.
+    ``truth`` maps sources to true poses (7,). Frames without a true pose or without an estimate do
+    not count.
     """
     covered = []
     for source, pose, each in zip(records.sources, records.poses, records.sets, strict=True):
@@ -218,7 +219,7 @@ def coverage(records: Records, chart: Chart, truth: Mapping[str, Array]) -> dict
 
 
 def _gap(first: Array, second: Array) -> Array:
-    """Absolute difference: 0 between equals, NaN and infinity too; infinite beside one of those."""
+    """Return the absolute difference: 0 for equal values, infinite if only one is finite."""
     same = (first == second) | (np.isnan(first) & np.isnan(second))
     with np.errstate(invalid="ignore"):
         gap = np.abs(first - second)
@@ -226,7 +227,7 @@ def _gap(first: Array, second: Array) -> Array:
 
 
 def _angles(first: Array, second: Array) -> Array:
-    """Angle in rad between the rotations of poses (n, 7) -> (n,); infinite where one has none."""
+    """Return the angles between rotations of poses (n, 7), (n,) rad; infinite if one is missing."""
     angles = np.zeros(len(first))
     for index, (one, other) in enumerate(zip(first[:, 3:], second[:, 3:], strict=True)):
         if np.isnan(one).any() or np.isnan(other).any():
@@ -242,7 +243,7 @@ def _largest(values: Array) -> float:
 
 
 def difference_lines(rows: Iterable[tuple[str, str, Difference]]) -> list[str]:
-    """Rows of bundle, scope and difference -> a table for a person, in mm and mrad."""
+    """Return a table of differences, in mm and mrad, from rows of bundle, scope and difference."""
     lines = [
         f"{'largest difference':29}{'scope':10}{'frames':>7}{'status':>7}{'position':>12}"
         f"{'rotation':>12}{'bound':>12}{'bound':>12}{'of width':>10}{'bands':>6}{'moved':>6}",
@@ -259,7 +260,7 @@ def difference_lines(rows: Iterable[tuple[str, str, Difference]]) -> list[str]:
 
 
 def coverage_lines(rows: Iterable[tuple[str, str, str, Mapping[str, Any]]]) -> list[str]:
-    """Rows of bundle, scope, processor and ``coverage`` -> a table for a person."""
+    """Return a table of coverage from rows of bundle, scope, processor and ``coverage``."""
     names = ("tx", "ty", "tz", "r1", "r2", "r3")
     lines = [
         f"{'coverage':29}{'scope':10}{'on':7}" + "".join(f"{n:>7}" for n in names) + " all six"

@@ -1,4 +1,4 @@
-"""Test frames on disk: flights that the demonstration bundles were neither trained nor set on."""
+"""Write test frames: flights used neither to train nor to calibrate the demonstration bundles."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from cvo_export.data.splits import same_split
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.datasets.seven_scenes import write_sequence
 
-# What calibration_artifacts/README.md trains and calibrates on.
+# The data set on which calibration_artifacts/README.md trains and calibrates.
 DATASET = "synthetic:room,flights=100"
 
 
 def write_test_frames(folder: Path, recorded: SplitSpec, per_flight: int) -> int:
-    """Write JPEG images and .pose.txt of the split's test flights -> how many frames.
+    """Write images and poses of the split's test flights and return the number of frames.
 
-    ``per_flight`` frames of each, evenly spaced in time. A folder that is there already is kept.
-    Raises SourceError where the split is not one of ``DATASET``.
+    Writes ``per_flight`` frames of each flight, evenly spaced in time, as JPEG and .pose.txt files.
+    Keeps an existing folder. Raises SourceError if the split does not belong to ``DATASET``.
     """
     dataset = open_dataset(DATASET)
     chosen = evenly(dataset, same_split(dataset, recorded).roles["test"], per_flight)
@@ -35,7 +35,7 @@ def write_test_frames(folder: Path, recorded: SplitSpec, per_flight: int) -> int
 
 
 def evenly(dataset: PoseDataset, indices: NDArray[np.int64], per_flight: int) -> NDArray[np.int64]:
-    """Of frame numbers (n,), ``per_flight`` of each sequence, the first and the last among them."""
+    """Choose ``per_flight`` of the frame numbers (n,) per sequence, including first and last."""
     sequences = dataset.sequence[indices]
     parts = [indices[sequences == number] for number in np.unique(sequences)]
     spaced = [np.linspace(0, part.size - 1, per_flight).round().astype(int) for part in parts]

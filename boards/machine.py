@@ -1,7 +1,7 @@
-"""Emulated boards: a Python of another processor, with the runtime alone, under qemu-user.
+"""Emulated boards: Python for another processor, with the runtime only, under qemu-user.
 
-Each is a virtual environment in a folder of its own; its ``bin/python`` starts the emulator. Python
-takes that script for its own executable, so that child processes are emulated, too.
+Each board is a virtual environment in its own folder, and its ``bin/python`` starts the emulator.
+Python treats this script as its executable, so child processes are emulated too.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from cvo_edge.vocabulary import Precision
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / ".boards"
 
-# What tests/edge and pytest's settings in pyproject.toml need; the others are oracles.
+# Packages required by tests/edge and pytest's settings in pyproject.toml. The other packages of the
+# extra are oracles.
 TEST_PACKAGES = ("pytest", "hypothesis", "pytest-timeout", "pytest-xdist")
 
-# The Python of Debian 12, and the newest C library that wheels for it may ask for.
+# Python version of Debian 12, and the newest glibc that its wheels may require.
 _DEBIAN_PYTHON = "3.11"
 _GLIBC_MINOR = 36
 
@@ -46,7 +47,7 @@ CPU revision\t: {revision}
 
 
 class SetUpError(Exception):
-    """Something that a board needs is missing or failed, in one line."""
+    """A board's requirement is missing or failed; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -56,15 +57,15 @@ class Board:
     Attributes
     ----------
     name, meaning
-        For a command line and for a person.
+        Name on the command line and description.
     emulator, cpu
-        qemu's program, and its name of the processor.
+        qemu program, and its name for the processor.
     saturates
-        Whether 8-bit products saturate there, unless onnxruntime is told otherwise.
+        Whether 8-bit products saturate unless an option of onnxruntime prevents it.
     tests
-        Those of the runtime alone that are run there; other contracts need onnx, too.
+        Tests to run on the board. They need only the runtime; other contract tests also need onnx.
     compared
-        Precisions whose records are compared; the others' self-tests are run alone.
+        Precisions whose records are compared; for the others, only the self-test runs.
     """
 
     name: str
@@ -95,10 +96,10 @@ BOARDS = {
             "avx2",
             "x86-64 with AVX2, without AVX-512 and VNNI",
             "qemu-x86_64-static",
-            # Without the features that the emulator would say on stderr it has not.
+            # The emulator warns on stderr about features it lacks, so they are disabled here.
             "Haswell-noTSX,-pcid,-x2apic,-tsc-deadline,-invpcid",
             saturates=True,
-            # In float32 a frame takes that emulator 18 seconds, in 8 bits one.
+            # Under this emulator a frame takes 18 seconds in float32 and one second in 8 bits.
             tests=(
                 *(f"tests/edge/test_{name}.py" for name in _WITHOUT_NETWORKS),
                 f"{_PREPARED}[cjp-int8]",
@@ -110,9 +111,9 @@ BOARDS = {
 
 
 def set_up(board: Board) -> Path:
-    """Make the board's Python in ``.boards/<name>/`` -> its path; what is there already is kept.
+    """Install the board's Python in ``.boards/<name>/`` and return its path.
 
-    Raises SetUpError where something is missing or fails.
+    Reuses existing parts. Raises SetUpError if a requirement is missing or a step fails.
     """
     if (sys.platform, platform.machine()) != ("linux", "x86_64"):
         found = f"{platform.system()} on {platform.machine()}"
@@ -133,7 +134,7 @@ def set_up(board: Board) -> Path:
         emulator = f"{board.emulator} -cpu {board.cpu}"
         wheels = []
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    # Or what this machine's Python has installed would be found, too.
+    # Otherwise the packages of this machine's Python would be visible.
     alone = "include-system-site-packages = false"
     (folder / "pyvenv.cfg").write_text(f"home = {interpreter.parent}\n{alone}\n", "utf-8")
     python = folder / "bin" / "python"
@@ -145,15 +146,15 @@ def set_up(board: Board) -> Path:
 
 
 def emulator_version(board: Board) -> str:
-    """Name and version of the emulator, as it says."""
+    """Return the emulator's own statement of name and version."""
     done = subprocess.run([board.emulator, "--version"], capture_output=True, text=True, check=True)
     return done.stdout.splitlines()[0]
 
 
 def requirements(project: Mapping[str, Any]) -> list[str]:
-    """Requirements of the runtime and its tests, as ``pyproject.toml`` (parsed) states them.
+    """Return the requirements of the runtime and its tests from the parsed ``pyproject.toml``.
 
-    Raises SetUpError where it has none for one of ``TEST_PACKAGES``.
+    Raises SetUpError if the extra ``test`` lacks one of ``TEST_PACKAGES``.
     """
     table = project["project"]
     tests = {_package(line): line for line in table["optional-dependencies"]["test"]}
@@ -173,14 +174,14 @@ def _install_emulator(board: Board) -> None:
     if not shutil.which("apt-get") or os.geteuid() != 0:
         raise SetUpError(
             f"{board.emulator}: not found; install the package qemu-user-static, or run this as "
-            "root where there is apt-get"
+            "root on a system with apt-get"
         )
     _call("apt-get", "-qq", "update")
     _call("apt-get", "-qq", "-y", "--no-install-recommends", "install", "qemu-user-static")
 
 
 def _extract_debian(folder: Path, root: Path) -> None:
-    """Fill ``root`` with Debian's Python for ARM: packages are unpacked, none is installed."""
+    """Unpack Debian's Python for ARM into ``root``, without installing any package."""
     for program in ("apt-get", "dpkg-deb"):
         if not shutil.which(program):
             raise SetUpError(f"{program}: not found; the ARM Python comes from Debian packages")
@@ -190,7 +191,8 @@ def _extract_debian(folder: Path, root: Path) -> None:
     (work / "lists" / "partial").mkdir(parents=True)
     (work / "cache" / "archives" / "partial").mkdir(parents=True)
     (work / "status").touch()
-    # Lists and a status of its own: nothing is known to be installed, and this machine's are kept.
+    # Use separate lists and an empty status, so that all dependencies are downloaded and this
+    # machine's package database is not changed.
     settings = {
         "APT::Architecture": "arm64",
         "APT::Architectures": "arm64",
@@ -207,7 +209,7 @@ def _extract_debian(folder: Path, root: Path) -> None:
     _call(*apt, *download, f"python{_DEBIAN_PYTHON}", "libstdc++6")
     for package in sorted((work / "cache" / "archives").glob("*.deb")):
         _call("dpkg-deb", "--extract", str(package), str(partial))
-    # onnxruntime reads it when it is imported, and crashes on an x86 one.
+    # onnxruntime reads /proc/cpuinfo on import and crashes if it describes an x86 processor.
     (partial / "proc").mkdir()
     (partial / "proc" / "cpuinfo").write_text(_arm_cpuinfo(os.cpu_count() or 1), "ascii")
     shutil.rmtree(work)
@@ -215,7 +217,7 @@ def _extract_debian(folder: Path, root: Path) -> None:
 
 
 def _arm_cpuinfo(cores: int) -> str:
-    """``/proc/cpuinfo`` of a Cortex-A72, revision r0p3, with the features that qemu gives it."""
+    """Return ``/proc/cpuinfo`` of a Cortex-A72, revision r0p3, with the features of qemu's."""
     features = "fp asimd evtstrm aes pmull sha1 sha2 crc32 cpuid"
     return "".join(
         _PROCESSOR.format(number=number, features=features, variant=0, part=0xD08, revision=3)
@@ -224,7 +226,7 @@ def _arm_cpuinfo(cores: int) -> str:
 
 
 def _arm_wheel_options() -> list[str]:
-    """Options by which pip takes wheels for ARM and Debian's Python."""
+    """Return pip options that select wheels for ARM and Debian's Python."""
     platforms = [f"manylinux_2_{minor}_aarch64" for minor in range(_GLIBC_MINOR, 16, -1)]
     tag = "cp" + _DEBIAN_PYTHON.replace(".", "")
     return [
@@ -237,9 +239,9 @@ def _arm_wheel_options() -> list[str]:
 
 
 def _install_packages(folder: Path, site: Path, wheels: list[str]) -> None:
-    """Install what the runtime and its tests need, in the releases that this Python has.
+    """Install the packages of the runtime and its tests, in the versions of this Python.
 
-    Others would compute other numbers on the same processor.
+    Other versions could compute different numbers on the same processor.
     """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     wanted = "\n".join(requirements(project)) + "\n"
@@ -262,5 +264,5 @@ def _call(*command: str) -> None:
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode != 0:
-        said = (done.stderr.strip() or done.stdout.strip() or "nothing was said").splitlines()
-        raise SetUpError(f"{Path(command[0]).name}: failed with {done.returncode}: {said[-1]}")
+        said = (done.stderr.strip() or done.stdout.strip() or "no output").splitlines()
+        raise SetUpError(f"{Path(command[0]).name}: exit code {done.returncode}: {said[-1]}")

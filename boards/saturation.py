@@ -1,9 +1,9 @@
-"""Poses of an int8 bundle with and without ``session.x64quantprecision``, on this very processor.
+"""Run an int8 bundle with and without ``session.x64quantprecision`` on this processor.
 
     python boards/saturation.py BUNDLE FOLDER COUNT
 
-A control: on x86 without VNNI the ones without it have to be off, else the comparison beside this
-one has not tried such a processor. Prints JSON, ``{"with": [poses], "without": [poses]}``.
+This is a control: on x86 without VNNI, the poses without the option must be wrong; otherwise the
+comparison did not test such a processor. Prints JSON, ``{"with": [poses], "without": [poses]}``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cvo_edge.input.sources import open_source
 
 
 def poses(bundle_dir: Path, folder: str, count: int, *, precise: bool) -> list[list[float]]:
-    """Raw outputs ``pose`` (7 numbers each) of the first ``count`` images of a folder."""
+    """Return the model's output ``pose`` (7 numbers) for the first ``count`` images of a folder."""
     bundle = read_bundle(bundle_dir)
     spec = bundle.calibration.preprocess
     extra = bundle.head.extra_inputs(0)

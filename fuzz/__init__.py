@@ -1,4 +1,4 @@
-"""Long provocation: what is wrong from outside, thousands of times, through the public interface.
+"""Fuzz tests: thousands of faulty inputs through the public interface.
 
-``make fuzz`` runs all of it and prints a table; the test-suite has the short form of each.
+``make fuzz`` runs all kinds and prints a table; the test suite runs a short form of each.
 """

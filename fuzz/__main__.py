@@ -1,7 +1,7 @@
-"""All of it, or what is named: ``python -m fuzz [NAME[=TRIALS] ...]``.
+"""Run all kinds of fuzz tests, or the named ones: ``python -m fuzz [NAME[=TRIALS] ...]``.
 
-Each kind writes its file into ``bench/results/faults``; a table of all that are there is printed at
-the end. Exits with 1 where a trial found something.
+Each kind writes a file to ``bench/results/faults``. At the end, prints a table of all existing
+results. Exits with 1 if a trial had a finding.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fuzz import bundles, kills, media, sensors, simulation
 from fuzz.trials import Tally
 
 FAULTS = RESULTS / "faults"
-# Name -> what is tried, how often, and by what.
+# Name -> description, number of trials, and function.
 KINDS: dict[str, tuple[str, int, Callable[[int], Tally]]] = {
     "models": ("model.onnx with changed bytes", 8000, bundles.models),
     "models_that_fit": (
@@ -42,15 +42,18 @@ KINDS: dict[str, tuple[str, int, Callable[[int], Tally]]] = {
 
 
 def main() -> int:
-    """Run what is named."""
+    """Run the named kinds, or all, and return the exit code."""
     named = dict(word.partition("=")[::2] for word in sys.argv[1:])
     unknown = sorted(set(named) - set(KINDS))
     if unknown:
-        print(f"fuzz: expected {', '.join(KINDS)}, found {', '.join(unknown)}", file=sys.stderr)
+        known = ", ".join(KINDS)
+        print(f"fuzz: expected names from {known}; found {', '.join(unknown)}", file=sys.stderr)
         return 2
     wrong = [word for word in named.values() if word and not re.fullmatch("[1-9][0-9]{0,8}", word)]
     if wrong:
-        print(f"fuzz: expected numbers of trials, found {', '.join(wrong)}", file=sys.stderr)
+        print(
+            f"fuzz: expected positive numbers of trials, found {', '.join(wrong)}", file=sys.stderr
+        )
         return 2
     found = 0
     for name in named or KINDS:
@@ -60,7 +63,7 @@ def main() -> int:
         begin = time.monotonic()
         tally = trials(count)
         if not tally.trials:
-            print(f"  nothing to try: {', '.join(tally.outcomes)}")
+            print(f"  no trials: {', '.join(tally.outcomes)}")
             continue
         report(name, what, tally, time.monotonic() - begin)
         found += len(tally.findings)
@@ -69,7 +72,7 @@ def main() -> int:
 
 
 def report(name: str, what: str, tally: Tally, seconds: float) -> None:
-    """Write one kind's file, and its findings to the terminal."""
+    """Write one kind's result file and print its findings."""
     for finding in tally.findings[:20]:
         print(f"  {finding}", flush=True)
     content: dict[str, Any] = {
@@ -84,7 +87,7 @@ def report(name: str, what: str, tally: Tally, seconds: float) -> None:
 
 
 def table() -> str:
-    """Return all results that are there as text."""
+    """Return a Markdown table of all existing results."""
     lines = ["| what | trials | findings | outcomes |", "| --- | --- | --- | --- |"]
     for name in KINDS:
         path = FAULTS / f"{name}.json"

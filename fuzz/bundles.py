@@ -1,4 +1,4 @@
-"""Mutated models and artifacts, as they are found on a card, and with digests made to fit."""
+"""Bundles with mutated files: with the original digests, and with digests made to fit."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from fuzz.mutate import Generator, changed_bytes, changed_document, with_digest
 from fuzz.trials import Tally, beside_each_other, command
 
 ARTIFACTS = Path(__file__).resolve().parent.parent / "calibration_artifacts"
-# The smallest of each method; the quantised one has the operators that the others lack.
+# The smallest bundle of each method, quantised, and a float32 bundle for the other operators.
 BUNDLES = tuple(
     ARTIFACTS / f"synthetic-room-{name}" for name in ("cjp-int8", "csp-int8", "mcqr-int8", "cjp")
 )
-# What may become of a bundle whose digests fit: all that a file can be wrong in, or a self-test
-# that fails; 0 is a bundle that passed it.
+# Permitted exit codes for a bundle whose digests fit: 0 if it passes its self-test, otherwise the
+# codes for invalid files and for a failed self-test.
 _PERMITTED = (0, 3, 4, 5, 8)
 
 
@@ -43,7 +43,7 @@ def _copy(number: int) -> Iterator[tuple[Path, Generator]]:
 
 
 def models(count: int) -> Tally:
-    """Change bytes of ``model.onnx``: every one is refused, before the engine sees it."""
+    """Change bytes of ``model.onnx``; each must be refused before the engine reads it."""
 
     def trial(number: int) -> tuple[str, str | None]:
         with _copy(number) as (bundle, generator):
@@ -55,7 +55,7 @@ def models(count: int) -> Tally:
 
 
 def artifacts(count: int) -> Tally:
-    """Change bytes or values of ``calibration.json``: every one is refused."""
+    """Change bytes or values of ``calibration.json``; each must be refused."""
 
     def trial(number: int) -> tuple[str, str | None]:
         with _copy(number) as (bundle, generator):
@@ -73,13 +73,13 @@ def _refused(bundle: Path, expected: tuple[type[CvoError], ...]) -> tuple[str, s
     except expected as error:
         many = "more than one line" if "\n" in str(error) else None
         return f"exit code {error.exit_code}", many
-    except Exception as error:  # noqa: BLE001 - that is the finding
+    except Exception as error:  # noqa: BLE001 - any other exception is a finding
         return "error", repr(error)
     return "accepted", "accepted"
 
 
 def models_that_fit(count: int) -> Tally:
-    """Change a model, all digests recomputed, and ask ``verify``."""
+    """Change a model, recompute all digests and run ``verify``."""
 
     def trial(number: int) -> tuple[str, str | None]:
         with _copy(number) as (bundle, generator):
@@ -96,7 +96,7 @@ def models_that_fit(count: int) -> Tally:
 
 
 def artifacts_that_fit(count: int) -> Tally:
-    """Change ``calibration.json``, its digest recomputed, and ask ``verify``."""
+    """Change ``calibration.json``, recompute its digest and run ``verify``."""
 
     def trial(number: int) -> tuple[str, str | None]:
         with _copy(number) as (bundle, generator):
@@ -111,13 +111,13 @@ def artifacts_that_fit(count: int) -> Tally:
 def _changed(
     path: Path, inside: Callable[[bytes, Generator], bytes], share: float, generator: Generator
 ) -> bytes:
-    """Return a file's content changed: so often within its format, else some of its bytes."""
+    """Return a file's changed content: by ``inside`` with probability ``share``, else by bytes."""
     change = inside if generator.random() < share else changed_bytes
     return change(path.read_bytes(), generator)
 
 
 def _changed_values(content: bytes, generator: Generator) -> bytes:
-    """Return a document with other values, keys or elements."""
+    """Return a document with changed values, keys or elements."""
     return changed_document(json.loads(content), generator)
 
 
@@ -125,12 +125,12 @@ def _verified(bundle: Path) -> tuple[str, str | None]:
     ended = command(["verify", bundle, "--threads", 1, "--timeout", 20])
     finding = ended.misbehaviour(_PERMITTED)
     if ended.code == 0 and not _answers_as_expected(bundle):
-        finding = "accepted, and its outputs are others than its self-test's"
+        finding = "accepted, but its outputs differ from its self-test"
     return f"exit code {ended.code}", finding
 
 
 def _answers_as_expected(bundle: Path) -> bool:
-    """Whether the engine alone gives what a bundle's self-test wants."""
+    """Return whether onnxruntime alone reproduces the outputs of a bundle's self-test."""
     calibration = read_calibration(bundle)
     test, spec = calibration.selftest, calibration.preprocess
     image = selftest_image(test.height, test.width)
@@ -149,7 +149,7 @@ def _answers_as_expected(bundle: Path) -> bool:
 
 
 def _changed_graph(content: bytes, generator: Generator) -> bytes:
-    """Return a model that is one still: a node, an attribute, a weight or a shape is another."""
+    """Return a model that still parses, with changed nodes, attributes, weights or shapes."""
     model = onnx.load_from_string(content)
     before = model.SerializeToString()
     while (after := model.SerializeToString()) == before:
@@ -158,7 +158,7 @@ def _changed_graph(content: bytes, generator: Generator) -> bytes:
 
 
 def _change(graph: onnx.GraphProto, generator: Generator) -> None:
-    """Change up to three things, where what is drawn is there to be changed."""
+    """Make up to three random changes; a change that does not apply is skipped."""
     for _ in range(int(generator.integers(1, 4))):
         kind = int(generator.integers(6))
         node = graph.node[int(generator.integers(len(graph.node)))]

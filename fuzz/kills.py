@@ -1,4 +1,4 @@
-"""Runs that are killed at any time: every record that was there before is there after."""
+"""Kill runs at random times: no record that was readable before may be lost."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LONGEST_S, _ATTEMPTS = 60.0, 3
 
 
 def kills(count: int) -> Tally:
-    """Kill a run after a random number of records that a reader has seen, and a random moment."""
+    """Kill a run after a random number of readable records and a short random delay."""
 
     def trial(number: int) -> tuple[str, str | None]:
         generator = np.random.default_rng([2027, number])
@@ -36,14 +36,14 @@ def kills(count: int) -> Tally:
                 if code == -signal.SIGKILL:
                     return _what_is_left(path, seen)
                 if code != 0:
-                    return "ended", f"ended by itself with exit code {code}"
-        return "ended", "ended before it was killed, in each attempt"
+                    return "ended", f"ended with exit code {code} before it was killed"
+        return "ended", "ended before it was killed, in every attempt"
 
     return beside_each_other(trial, count)
 
 
 def _killed(path: Path, generator: np.random.Generator) -> tuple[int, int]:
-    """Start a run and kill it -> records that a reader had seen before, and the exit code."""
+    """Start a run and kill it; returns the number of records before, and the exit code."""
     wanted, more_s = int(generator.integers(1, 49)), float(generator.exponential(0.002))
     path.unlink(missing_ok=True)
     process = subprocess.Popen(
@@ -64,7 +64,7 @@ def _killed(path: Path, generator: np.random.Generator) -> tuple[int, int]:
 
 
 def _written(path: Path) -> int:
-    """Number of records, each a line; the first line is the header."""
+    """Return the number of complete record lines; the first line is the header."""
     return max(0, path.read_bytes().count(b"\n") - 1) if path.exists() else 0
 
 
@@ -74,6 +74,6 @@ def _what_is_left(path: Path, seen: int) -> tuple[str, str | None]:
     except SourceError as error:
         return "unreadable", str(error)
     if records != list(range(len(records))) or len(records) < seen:
-        return "lost", f"{seen} records were seen, {len(records)} are there"
+        return "lost", f"{seen} records before the kill, {len(records)} after it"
     torn = path.read_bytes()[-1:] not in (b"", b"\n")
     return "torn last line" if torn else "whole", None

@@ -1,4 +1,4 @@
-"""Image files and videos with changed bytes, through ``cvo-edge run``."""
+"""Run ``cvo-edge run`` on image files and videos with changed bytes."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _MANY = 20
 
 
 def images(count: int) -> Tally:
-    """Twenty changed files in a folder, a good one before and behind each: those are as ever.
+    """Mix twenty changed files with intact ones; the intact files' poses must not change.
 
-    One trial is a file.
+    Each changed file is one trial.
     """
     tally = Tally()
     for found in beside_each_other(_folder_of_images, -(-count // _MANY)).outcomes.elements():
@@ -58,18 +58,18 @@ def _folder_of_images(number: int) -> tuple[str, str | None]:
             if "-b" in record["source"]:
                 outcomes[record["status"]] = outcomes.get(record["status"], 0) + 1
             elif record["pose"] != _as_ever()[record["source"][:3]]:
-                finding = f"{record['source']}: another pose than without its neighbours"
+                finding = f"{record['source']}: its pose depends on the damaged files"
     return json.dumps([outcomes, finding and f"folder {number}: {finding}"]), None
 
 
 def _records(output: bytes) -> list[Any]:
-    """Return the lines behind the header, decoded."""
+    """Return the decoded lines after the header."""
     return [json.loads(line) for line in output.splitlines()[1:]]
 
 
 @cache
 def _as_ever() -> dict[str, object]:
-    """Poses of the good files alone, by number."""
+    """Return the poses of the intact files without damaged ones, by number."""
     ended = command(["run", _BUNDLE, _CLIP, "--quiet", "--threads", 1, "--max-frames", _MANY])
     records = _records(ended.output)
     return {f"{number:03d}": record["pose"] for number, record in enumerate(records)}
@@ -82,9 +82,9 @@ def _picture(path: Path) -> NDArray[Any]:
 
 
 def videos(count: int) -> Tally:
-    """Change a video of 20 frames: read to its end, refused, or told that it ended early.
+    """Change a video of 20 frames; it must be read to its end, be refused or end with an error.
 
-    Its records are in order in any case.
+    Its records must be in order in all cases.
     """
 
     def trial(number: int) -> tuple[str, str | None]:
@@ -100,7 +100,7 @@ def videos(count: int) -> Tally:
 
 
 def _out_of_order(output: bytes) -> str | None:
-    """Return what is wrong with a video's records: numbers, names or times out of turn, or None."""
+    """Return a finding if numbers, names or stamps of a video's records are out of order."""
     records = _records(output)
     if [(record["seq"], record["source"]) for record in records] != [
         (number, f"clip.avi#{number}") for number in range(len(records))

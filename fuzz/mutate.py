@@ -1,4 +1,4 @@
-"""Bytes and JSON documents with a few things changed, by a generator of random numbers."""
+"""Random mutations of bytes and JSON documents."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Generator = np.random.Generator
 
 
 def changed_bytes(content: bytes, generator: Generator) -> bytes:
-    """Return other bytes: one to four changes of one kind each."""
+    """Return different bytes, after one to four random changes."""
     changed = content
     while changed == content:
         for _ in range(int(generator.integers(1, 5))):
@@ -69,7 +69,7 @@ def _exchange(content: bytes, generator: Generator) -> bytes:
 
 
 def _span(content: bytes, generator: Generator) -> tuple[int, int]:
-    """A place, and a length that is mostly small."""
+    """Return a random start and a length that is usually small."""
     longest = max(1, min(len(content) // 2, 4096))
     length = int(math.exp(generator.uniform(0.0, math.log(longest + 1))))
     return int(generator.integers(max(1, len(content) - length + 1))), max(1, length)
@@ -87,19 +87,19 @@ _BYTE_CHANGES: tuple[Callable[[bytes, Generator], bytes], ...] = (
     _exchange,
 )
 
-# In place of any value of a document.
+# Replacements for any value of a document.
 _VALUES: tuple[object, ...] = (
     *(None, True, False, 0, 1, -1, 2**31, 2**63, -(2**63), 10**19),
     *(0.0, -0.0, 0.5, -1.5, 1e-300, 1e300, -1e300, 1e38),
     *("", "x", "\x1b[31m", "../../etc/passwd", "\ud800", "1", "NaN", "ok" * 150),
     *([], [0], [[]], [None] * 6, [1e9] * 6, {}, {"a": 1}),
 )
-# In place of a number, in the text, where JSON has no such value.
+# Replacements for a digit in the text; most are not valid JSON numbers.
 _WORDS = ("NaN", "Infinity", "-Infinity", "1e999", "-1e999", "0x10", "1_000", "01", "9" * 5000)
 
 
 def changed_document(document: dict[str, Any], generator: Generator) -> bytes:
-    """Return JSON of a document with one to three values, keys or elements changed."""
+    """Return a document as JSON, after one to three changes of values, keys or elements."""
     changed = copy.deepcopy(document)
     for _ in range(int(generator.integers(1, 4))):
         places = list(_places(changed))
@@ -135,7 +135,7 @@ def _places(node: Any) -> Any:  # noqa: ANN401 - any JSON value
 
 
 def with_digest(content: bytes) -> bytes:
-    """Return ``calibration.json`` with its own digest made to fit, where it still has a place."""
+    """Return ``calibration.json`` with a matching digest, if it still has a digest field."""
     start = content.find(b'"digest": "')
     if start < 0:
         return content

@@ -1,4 +1,4 @@
-"""A camera that fails in every way it can, frame by frame, among clean frames."""
+"""Camera streams that mix faulty frames of every kind with clean frames."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _CLIP = ARTIFACTS / "synthetic-room-clip"
 _BUNDLES = tuple(
     ARTIFACTS / f"synthetic-room-{method}-int8" for method in ("cjp", "cqr", "csp", "mcqr")
 )
-# Height and width that the bundles' networks see.
+# Height and width of the bundles' model input.
 _MODEL_SIZE = (192, 256)
-# Of clean frames, at most.
+# Largest permitted share of flagged clean frames.
 _FALSE_ALARMS = 0.01
-# Every frame differs from all others by a sensor's noise.
+# Sensor noise, in grey levels, that makes all frames different.
 _NOISE = 2.0
 _STEP_NS = 33_000_000
 
@@ -65,7 +65,7 @@ def _with_nan(image: Image, generator: Generator) -> Image:
     return broken
 
 
-# Kind -> (image, those before, generator) -> image or None.
+# Name -> function of (image, earlier images, generator) that returns a faulty image, or None.
 _IMAGES: dict[str, Callable[[Image, Sequence[Image], Generator], Image | None]] = {
     "black": lambda image, _, __: np.zeros_like(image),
     "black with noise": lambda image, _, g: _noisy(np.zeros_like(image), g, g.uniform(1.0, 6.0)),
@@ -87,10 +87,10 @@ _KINDS = (*_IMAGES, *_STAMPS, "stale")
 
 
 def sensors(count: int) -> Tally:
-    """Fault ``count`` frames of a stream, and leave as many as they are, in any order.
+    """Process ``count`` faulty frames and about as many clean ones, in random order.
 
-    Findings are faulted frames with a finite interval, and more than one in a hundred clean frames
-    without one.
+    Findings are faulty frames with a finite interval, and a share of flagged clean frames above
+    one in a hundred.
     """
     tally = Tally()
     for number, bundle in enumerate(_BUNDLES):
@@ -133,12 +133,12 @@ def _check_false_alarms(tally: Tally) -> None:
 def _estimates(
     odometer: Odometer, count: int, generator: Generator
 ) -> Iterator[tuple[str | None, PoseInterval]]:
-    """Yield each estimate with its frame's kind of fault, None if clean, until ``count`` faults."""
+    """Yield the kind of fault (None: clean) and the estimate of frames, until ``count`` faults."""
     images = [frame.image for frame in open_source(str(_CLIP)) if frame.image is not None]
     kinds: list[str | None] = []
 
     def frames() -> Iterator[Frame]:
-        # As many as a driver may have.
+        # As many buffers as a camera driver may have.
         before: deque[Image] = deque([images[0]], maxlen=8)
         now_ns, left = 0, count
         while left > 0:
@@ -169,10 +169,10 @@ def _estimates(
 
 
 def recordings(count: int) -> Tally:
-    """Look at the first ``count`` images of each real recording in ``$CVO_DATA``, where it is set.
+    """Check the first ``count`` images of each real recording in ``$CVO_DATA``, if it is set.
 
-    All are clean. A recording that holds a frame twice, byte for byte, is told of the second: that
-    is no false alarm. Findings as for ``sensors``.
+    All frames are clean, but a recording may contain the same file twice in a row; flagging the
+    second is not a false alarm. The finding is a share of false alarms above one in a hundred.
     """
     tally = Tally()
     data = os.environ.get("CVO_DATA")
@@ -186,7 +186,7 @@ def recordings(count: int) -> Tally:
             tally.add(_told_of(decode_image(content), content == before, checks))
             before = content
     twice = sum(n for name, n in tally.outcomes.items() if name.startswith("twice"))
-    tally.summary = f"{twice} frames that a recording holds twice, told of"
+    tally.summary = f"{twice} repeated frames of the recordings flagged"
     _check_false_alarms(tally)
     return tally
 

@@ -1,4 +1,4 @@
-"""Coverage with few calibration scores: as often as stated, or unbounded, over many repetitions."""
+"""Simulated coverage with few calibration scores: as stated, or unbounded."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _STANDARD_ERRORS = 4.5
 def coverage(count: int) -> Tally:
     """Draw n calibration and 200 test scores, ``count`` times for each n.
 
-    Finite thresholds: mean coverage is k/(n + 1), k = ceil((n + 1) confidence), within 4.5 standard
-    errors (each repetition's coverage is Beta-binomial). Where k > n it is unbounded. One trial is
-    one repetition of one n at one confidence.
+    With finite thresholds, the mean coverage must be k/(n + 1), k = ceil((n + 1) confidence),
+    within 4.5 standard errors (the coverage of one repetition is Beta-binomial). If k > n, the
+    threshold must be unbounded. One trial is one repetition of one n at one confidence.
     """
     tally, said = Tally(), list[str]()
     for n in SIZES:
         generator = np.random.default_rng([2031, n])
-        # With signs and a heavy tail: only their order counts.
+        # The distribution may be signed and heavy-tailed, because only the order of scores counts.
         draws = generator.standard_t(2, (count, n + _TESTS))
         for confidence in CONFIDENCES:
             k = math.ceil(round((n + 1) * confidence, 9))

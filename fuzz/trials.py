@@ -1,4 +1,4 @@
-"""What a trial must not do, and counting those that did."""
+"""Run trials, check how commands end, and count outcomes and findings."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _PROGRAM = "from cvo_edge.__main__ import main; main()"
 
 @dataclass
 class Tally:
-    """Trials of one kind: how they ended, and findings, each a line that says how to repeat it.
+    """Outcomes and findings of one kind of trial; each finding is a line that identifies its trial.
 
-    ``summary`` is what the table says of them, by default the outcomes.
+    ``summary`` is the text for the table, by default the outcomes.
     """
 
     trials: int = 0
@@ -36,7 +36,7 @@ class Tally:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended; ``code`` is negative for a signal, None where it was still at work."""
+    """How a command ended; ``code`` is negative for a signal and None after a timeout."""
 
     code: int | None
     output: bytes
@@ -44,15 +44,15 @@ class Ended:
     seconds: float
 
     def misbehaviour(self, allowed: Sequence[int]) -> str | None:
-        """Return what it must not have done, or None."""
+        """Return how the command violated its contract, or None."""
         if self.code is None:
-            return f"still at work after {self.seconds:.0f} s"
+            return f"still running after {self.seconds:.0f} s"
         if self.code not in allowed:
             return f"exit code {self.code}: {self.errors[-300:]!r}"
         if "Traceback" in self.errors:
-            return f"a traceback: {self.errors[-300:]!r}"
+            return f"traceback: {self.errors[-300:]!r}"
         if self.code != 0 and len(self.errors.splitlines()) != 1:
-            return f"not one line on stderr: {self.errors[-300:]!r}"
+            return f"expected one line on stderr: {self.errors[-300:]!r}"
         return None
 
 
@@ -73,7 +73,7 @@ def command(arguments: Sequence[object], timeout_s: float = 120.0) -> Ended:
 
 
 def beside_each_other(trial: Callable[[int], tuple[str, str | None]], count: int) -> Tally:
-    """Run numbered trials, as many at a time as there are cores; each gives outcome and finding."""
+    """Run numbered trials in parallel, one per core; each returns an outcome and a finding."""
     tally, begin = Tally(), time.monotonic()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number, (outcome, finding) in enumerate(pool.map(trial, range(count))):

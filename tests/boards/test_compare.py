@@ -1,4 +1,4 @@
-"""Records of two processors: what counts as a difference, and what is too much."""
+"""Records from two processors: measured differences and tolerances."""
 
 import copy
 import math
@@ -24,7 +24,7 @@ IDENTITY = [0.0, 0.0, 0.0, 1.0]
 
 
 def record(number=0, half_width=0.5, bands=None):
-    """A frame at the origin, its sets ``half_width`` to both sides."""
+    """Return a record of a frame at the origin with sets of +-``half_width``."""
     return {
         "source": f"{number}.jpg",
         "status": "ok",
@@ -43,7 +43,7 @@ def invalid(number=0):
 
 
 def run_of(lines):
-    """Records with what these tests look at, and values for the rest of their keys."""
+    """Return records with the given keys and default values for all others."""
     rest = {"seq": 0, "stamp_ns": None, "reasons": [], "latency_ms": {}}
     chart = {"confidence": 0.9, "scope": "marginal", "rotation": "tangent_reference"}
     return stacked(
@@ -141,7 +141,7 @@ def test_coverage_is_the_share_of_frames_whose_set_holds_the_truth():
         "1.jpg": np.array([0.6, 0.0, 0.0, *IDENTITY]),
         "2.jpg": np.array([0.0, 0.0, 0.0, *IDENTITY]),
     }
-    # Number 2 has no pose, number 3 no truth.
+    # Frame 2 has no pose, and frame 3 has no truth.
     run = run_of([record(0), record(1), invalid(2), record(3)])
     found = coverage(run, CHART, truth)
     assert found == {"frames": 2, "per_dof": [0.5, 1.0, 1.0, 1.0, 1.0, 1.0], "all_six": 0.5}

@@ -1,4 +1,4 @@
-"""What is installed on an emulated board."""
+"""The packages that are installed on an emulated board."""
 
 import tomllib
 

@@ -1,4 +1,4 @@
-"""``make fuzz`` in small: nothing is found, and what is expected to happen does."""
+"""A short ``make fuzz``: no findings, and every kind of trial has its expected effect."""
 
 import numpy as np
 import pytest
@@ -20,10 +20,10 @@ SHORT = {
     "videos": 6,
     "coverage": 100,
 }
-# What some trial of a kind must have led to: or nothing was tried.
+# An outcome that at least one trial of each kind must have; otherwise the trials had no effect.
 SEEN = {
     "models": "exit code 5",
-    # That of a model which is none: so its digests did fit.
+    # An invalid model, which is reached only if the digests fit.
     "models_that_fit": "exit code 4",
     "kills": "whole",
     "artifacts": "exit code 3",
@@ -57,10 +57,10 @@ def test_what_tries_nothing_is_refused(monkeypatch, word):
 
 
 def test_what_would_be_a_finding_is_one(monkeypatch, artifacts_dir):
-    # A reader without digests takes what it is given.
+    # A reader that checks no digests accepts everything.
     monkeypatch.setattr(bundles, "read_bundle", lambda _: None)
     assert len(bundles.models(4).findings) == len(bundles.artifacts(4).findings) == 4
-    # Nothing is looked at: every fault has an interval.
+    # Without frame checks, every faulted frame gets an interval.
     monkeypatch.setattr("cvo_edge.odometer.image_doubt", lambda _: None)
     monkeypatch.setattr("cvo_edge.input.frame_checks.StreamChecks.doubts", lambda *_: ())
     assert sensors.sensors(40).findings
@@ -81,10 +81,10 @@ def test_another_pose_behind_a_damaged_image_is_found(monkeypatch):
 @pytest.mark.parametrize(
     ("ended", "said"),
     [
-        (Ended(None, b"", "", 9.0), "still at work"),
+        (Ended(None, b"", "", 9.0), "still running"),
         (Ended(-11, b"", "", 1.0), "exit code -11"),
-        (Ended(4, b"", "Traceback (most recent call last):", 1.0), "a traceback"),
-        (Ended(4, b"", "one\ntwo\n", 1.0), "not one line"),
+        (Ended(4, b"", "Traceback (most recent call last):", 1.0), "traceback: "),
+        (Ended(4, b"", "one\ntwo\n", 1.0), "expected one line"),
         (Ended(4, b"", "one\n", 1.0), None),
     ],
 )
