@@ -147,7 +147,7 @@ class Difference:
 
 
 def difference(first: Records, second: Records, tolerance: Tolerance) -> Difference:
-    """Compare two runs, in widths of the first; raises ValueError if their frames differ."""
+    """Compare two runs, relative to the widths of the first; raises ValueError on other frames."""
     if first.sources != second.sources:
         raise ValueError("expected records of the same frames in the same order")
     position = _largest(np.linalg.norm(_gap(first.poses, second.poses)[:, :3], axis=1))

@@ -191,7 +191,7 @@ def with_thresholds(
 
 
 def counts(cal: Scored) -> Counts:
-    """Count the frames, sequences and effective frames behind calibration scores."""
+    """Count the frames, sequences and effective frames of calibration scores."""
     return Counts(
         frames=len(cal.sequence),
         sequences=len(np.unique(cal.sequence)),
