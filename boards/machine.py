@@ -77,8 +77,8 @@ class Board:
     compared: tuple[Precision, ...]
 
 
-_WITHOUT_NETWORKS = ("conformal", "geometry", "heads", "pose", "preprocess", "trajectory")
-_PREPARED = "tests/edge/test_prepared.py::test_a_prepared_model_computes_the_very_same"
+_WITHOUT_NETWORKS = ("conformal", "geometry", "heads", "pose", "preprocess", "ground_truth")
+_PREPARED = "tests/edge/test_model_cache.py::test_a_prepared_model_computes_the_very_same"
 
 BOARDS = {
     board.name: board
