@@ -156,7 +156,7 @@ def test_only_the_point_network_has_the_residual_score(runs, tmp_path):
 
 
 def gaussian_of(points):
-    """Points (passes, n, 6) -> the Gaussian's 5 % and 95 % quantiles."""
+    """Return 5 % and 95 % quantiles of the Gaussian fitted to points (passes, n, 6)."""
     mean, deviation = points.mean(axis=0), points.std(axis=0)
     return norm.ppf(0.05, mean, deviation), norm.ppf(0.95, mean, deviation)
 
