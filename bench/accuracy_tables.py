@@ -138,7 +138,7 @@ def choice() -> str:
             ["score", *two(lambda seeds: float(np.median([score(r) for r in seeds])), "{:.3f}")],
             ["volume of the joint set, over CQR's", *map(over_cqr, METHODS)],
             [
-                "a frame, 640x480 array to interval, in turns",
+                "time per frame, 640x480 array to interval, in turns",
                 *(
                     f"{timing[method]['p50']:.1f} ms, of it "
                     f"{latency[method]['latency_ms']['conformal']['p50']:.2f} after the network"
@@ -178,7 +178,7 @@ DIGITS = {"coverage": 3, "joint": 3, "score": 3, "MB": 1}
 
 
 def precisions() -> str:
-    """Return float32 beside 8 bits, a line for each data set, network, method and precision."""
+    """Return float32 beside 8 bits, one line per data set, network, method and precision."""
     cells: dict[tuple[str, ...], list[Report]] = defaultdict(list)
     for path in result_files("precision"):
         found = read_result("precision", path.stem)

@@ -2,8 +2,8 @@
 
     python bench/against.py OTHER_CHECKOUT [ROUNDS]
 
-Each checkout runs in a process of its own, and the two take turns of a few frames, so that a change
-of the machine's speed meets both. A turn times the step from an image array to the interval and the
+Each checkout runs in its own process; the processes alternate every few frames, so that a change of
+the machine's speed affects both. A turn times the step from an image array to the interval and the
 bare call of the session on the same input. The result goes to ``results/speed/against.json``.
 """
 

@@ -1,6 +1,6 @@
 """Tables of ``results/compare`` for ``bench/tables.py``.
 
-Methods and baselines beside each other, medians over seeds.
+Methods and baselines side by side, medians over seeds.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ Report = dict[str, Any]
 
 
 def comparison() -> str:
-    """Return one line a method, with the figures of both recordings as pairs."""
+    """Return one line per method, with the figures of both recordings as pairs."""
     found = [_report(name) for name in RECORDINGS]
     methods = {cell["method"] for report in found for cell in report["cells"]}
     head = [
         *("", "score, own bounds", "score, calibrated", "coverage per DoF"),
         *("joint scope: coverage", "its volume^(1/6)", "median error", "training", "head"),
-        "a frame",
+        "per frame",
     ]
     # The sum of logarithms: recordings of any difficulty count alike.
     order = sorted(methods, key=lambda name: float(np.log(scores(found, name)).sum()))
@@ -120,7 +120,7 @@ def median(report: Report, method: str, figure: Callable[[Cell], Any]) -> float 
 
 
 def cells(report: Report, method: str) -> list[Cell]:
-    """Return the cells of a method, one a seed."""
+    """Return the cells of a method, one per seed."""
     return [cell for cell in report["cells"] if cell["method"] == method]
 
 

@@ -94,7 +94,7 @@ class Timed:
             self._odometer.session.run(self._feeds)
 
     def step(self, number: int) -> None:
-        """From an array to intervals."""
+        """Time one step, from image array to interval."""
         estimate = self._odometer.step(self._image)
         if not estimate.bounded:
             raise SystemExit(f"frame {number}: expected finite intervals, found unbounded ones")

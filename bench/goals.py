@@ -148,7 +148,7 @@ def goals() -> list[Goal]:
             both(1.1, 1.1),
         ),
         Goal(
-            "files a second: mode throughput in 8 bits / naive script in float32",
+            "files per second: mode throughput in 8 bits / naive script in float32",
             at("stream", "{}", "throughput", "throughput int8", "naive_over_this", "median"),
             {MOBILENET: 2.5},
             at_least=True,
@@ -179,12 +179,12 @@ def goals() -> list[Goal]:
             {MOBILENET: 1.0},
         ),
         Goal(
-            "processor time at 30 frames a second / onnxruntime: float32, 2 threads",
+            "processor time at 30 frames per second / onnxruntime: float32, 2 threads",
             at("stream", "{}", "camera", "live fp32, 2", "over_onnxruntime", "median"),
             both(0.3, 0.3),
         ),
         Goal(
-            "processor time at 30 frames a second / onnxruntime: 8 bits, 1 thread",
+            "processor time at 30 frames per second / onnxruntime: 8 bits, 1 thread",
             at("stream", "{}", "camera", "live int8, 1", "over_onnxruntime", "median"),
             both(0.15, 0.15),
         ),

@@ -14,8 +14,6 @@ def results_index() -> str:
         study = json.loads(path.read_text("utf-8"))
         lines = [f"### {path.parent.name}", "", study["what"], ""]
         lines += [f"    {command}" for command in study["commands"]]
-        if "ran_as" in study:
-            lines += ["", "Run as", "", *(f"    {command}" for command in study["ran_as"])]
         lines += ["", f"Machine: {study['machine']}."]
         for added in study.get("added", ()):
             lines.append(

@@ -237,7 +237,7 @@ def draw(name: str, d: int, sets: dict[str, Regions | Boxes], path: Path) -> Non
 
 
 def main() -> None:
-    """Print a line a shape; write pictures and, where asked, all figures as JSON."""
+    """Print one line per shape; write pictures and, where asked, all figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--json", type=Path)

@@ -14,7 +14,11 @@ from markdown_table import table
 from networks import BACKBONES
 from provenance import read_result
 
-SHORT = {"mobilenetv2_100": "MobileNetV2", "resnet34": "ResNet34", "demonstration": "cut short"}
+SHORT = {
+    "mobilenetv2_100": "MobileNetV2",
+    "resnet34": "ResNet34",
+    "demonstration": "truncated network",
+}
 
 Rows = Iterator[list[str]]
 
@@ -65,7 +69,13 @@ def precision(results: dict[str, Any]) -> Rows:
 
 def throughput(results: dict[str, Any]) -> Rows:
     """JPEG files to records."""
-    yield ["network", "files to records", "ms a frame", "frames a second", "naive script / this"]
+    yield [
+        "network",
+        "files to records",
+        "ms per frame",
+        "frames per second",
+        "naive script / this",
+    ]
     for name in BACKBONES:
         for what, row in results[name]["throughput"].items():
             cells = [two(row["ms_per_frame"]), number(row["frames_per_second"], 0)]
@@ -75,7 +85,7 @@ def throughput(results: dict[str, Any]) -> Rows:
 def camera(results: dict[str, Any]) -> Rows:
     """A steady camera."""
     yield [
-        *("network", "30 frames a second", "processor ms a frame", "/ onnxruntime"),
+        *("network", "30 frames per second", "processor ms per frame", "/ onnxruntime"),
         *("age of a frame, ms", "dropped"),
     ]
     for name in BACKBONES:

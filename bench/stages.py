@@ -3,7 +3,7 @@
     python bench/stages.py
 
 The demonstration network on two threads, frames of 640x480 that have just been written; medians.
-Then OpenCV's calls of the preprocessing, each in a loop of its own.
+Then each OpenCV call of the preprocessing in a separate loop.
 """
 
 from __future__ import annotations

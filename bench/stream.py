@@ -3,9 +3,9 @@
     python bench/stream.py
 
 Throughput: JPEG files to JSON records, by a sequential script on onnxruntime with default settings
-(``naive``) and by ``Odometer.stream`` in each mode and precision, in turns. Camera: 30 frames a
-second; processor time a frame of onnxruntime with default settings (the model alone, on a prepared
-input) and of mode ``live``.
+(``naive``) and by ``Odometer.stream`` in each mode and precision, in turns. Camera: 30 frames
+per second; processor time per frame of onnxruntime with default settings (the model alone, on a
+prepared input) and of mode ``live``.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def throughput(backbone: str) -> dict[str, Any]:
 
 
 def camera(backbone: str) -> dict[str, Any]:
-    """Processor time a frame at 30 frames a second, in turns of some seconds; ages in ms."""
+    """Processor time per frame at 30 frames per second, in turns of some seconds; ages in ms."""
     count = FPS * SECONDS
     pictures = images()
     feeds = {"image": np.zeros((1, 224, 224, 3), np.uint8)}
@@ -209,7 +209,7 @@ def main() -> None:
         }
         for name, row in results[backbone]["throughput"].items():
             print(
-                f"{backbone:<16} {name:<17} {row['ms_per_frame']['median']:7.2f} ms a frame, "
+                f"{backbone:<16} {name:<17} {row['ms_per_frame']['median']:7.2f} ms per frame, "
                 f"{row['naive_over_this']['median']:.2f} times the naive script",
                 flush=True,
             )

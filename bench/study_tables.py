@@ -36,7 +36,7 @@ def results() -> dict[str, Any]:
 
 
 def cells(grid: str, method: str = "cjp", backbone: str = "", **varied: object) -> list[Cell]:
-    """Return the cells of a grid, one a seed, for one value of each option that varies."""
+    """Return the cells of a grid, one per seed, for one value of each option that varies."""
     found = [
         results()["cells"][place["cell"]]
         for place in results()["places"]
@@ -110,7 +110,7 @@ def table_one() -> str:
         [
             row("disjoint bands (no, yes, no, no): share of sets in pieces", pieces),
             row(
-                "complexity (low, low, high, medium): ms a frame, MiB of the model",
+                "complexity (low, low, high, medium): ms per frame, MiB of the model",
                 complexity,
             ),
             [

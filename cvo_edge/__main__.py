@@ -8,7 +8,7 @@ from typing import NoReturn
 
 def main() -> NoReturn:
     """Entry point of ``cvo-edge``."""
-    # Unless whoever started it had it ignored.
+    # Keep SIGINT ignored if the parent process ignores it.
     interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if interruptible:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -26,11 +26,11 @@ KINDS: dict[str, tuple[str, int, Callable[[int], Tally]]] = {
         2000,
         bundles.models_that_fit,
     ),
-    "artifacts": ("calibration.json with changed bytes or values", 8000, bundles.artifacts),
-    "artifacts_that_fit": (
+    "calibrations": ("calibration.json with changed bytes or values", 8000, bundles.calibrations),
+    "calibrations_that_fit": (
         "calibration.json with changed content and a matching digest, through verify",
         2000,
-        bundles.artifacts_that_fit,
+        bundles.calibrations_that_fit,
     ),
     "kills": ("run killed at a random time", 1000, kills.kills),
     "sensors": ("faulted frames of a camera among as many clean ones", 10000, sensors.sensors),

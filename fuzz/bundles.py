@@ -54,7 +54,7 @@ def models(count: int) -> Tally:
     return beside_each_other(trial, count)
 
 
-def artifacts(count: int) -> Tally:
+def calibrations(count: int) -> Tally:
     """Change bytes or values of ``calibration.json``; each must be refused."""
 
     def trial(number: int) -> tuple[str, str | None]:
@@ -95,7 +95,7 @@ def models_that_fit(count: int) -> Tally:
     return beside_each_other(trial, count)
 
 
-def artifacts_that_fit(count: int) -> Tally:
+def calibrations_that_fit(count: int) -> Tally:
     """Change ``calibration.json``, recompute its digest and run ``verify``."""
 
     def trial(number: int) -> tuple[str, str | None]:

@@ -1,1 +1,1 @@
-"""Bundles on disk: format, strict reading and writing, consistency rules, signatures."""
+"""Bundles on disk: format, strict reading and writing, rules, signatures."""

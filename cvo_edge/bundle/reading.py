@@ -60,7 +60,7 @@ def _check_model_digest(path: Path, found: str, calibration: Calibration) -> Non
     if found != calibration.model.sha256:
         raise BundleMismatchError(
             f"{path}: expected sha256 {calibration.model.sha256} (from {CALIBRATION_FILE}), "
-            f"found {found}"
+            f"found {found}; copy the bundle again"
         )
 
 
@@ -210,7 +210,8 @@ def _digest_span(content: bytes) -> tuple[int, int]:
     spans = [match.span(1) for match in _DIGEST.finditer(content)]
     if len(spans) != 1:
         raise CalibrationFileError(
-            f"digest: expected one key with 64 hexadecimal digits, found {len(spans)} keys"
+            f"digest: expected one key with 64 hexadecimal digits, found {len(spans)} keys; "
+            "copy the bundle again"
         )
     return spans[0]
 
@@ -222,5 +223,6 @@ def _check_digest(content: bytes) -> None:
     found = content[start:stop].decode("ascii")
     if found != expected:
         raise CalibrationFileError(
-            f"digest: expected {expected} for these bytes, found {found}; the file was altered"
+            f"digest: expected {expected} for these bytes, found {found}; "
+            "the file was altered: copy the bundle again"
         )

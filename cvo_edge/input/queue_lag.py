@@ -23,7 +23,7 @@ class DriverStamps:
         self._resumed_at, self._missing_s = -math.inf, 0.0
 
     def age_s(self, stamp_s: float, awake_s: float, now_s: float) -> float | None:
-        """Return the age of a frame stamped ``stamp_s``, or None if that is no such stamp.
+        """Return the age of a frame stamped ``stamp_s``, or None if it is not on that clock.
 
         ``awake_s`` and ``now_s`` are the present on the monotonic clock, which stops while the
         machine is suspended, and on one that does not stop.

@@ -228,7 +228,7 @@ def bench(
         int, typer.Option(min=0, max=MOST_MEASURED, help="Frames to run before measuring.")
     ] = 20,
     mode: Annotated[
-        Mode, typer.Option(help="As for run; live plays files at 30 frames a second.")
+        Mode, typer.Option(help="As for run; live plays files at 30 frames per second.")
     ] = "latency",
     threads: ThreadsOption = None,
     cache: CacheOption = True,

@@ -11,7 +11,7 @@ INTERVALS, RUNTIME, REPORT = "Intervals", "Runtime", "Output"
 
 
 def examples(*commands: str) -> str:
-    """Return the epilog that lists commands, one a line."""
+    """Return the epilog that lists commands, one per line."""
     return "\n\n".join(["Examples:", *commands])
 
 

@@ -145,8 +145,8 @@ def _draft(
     config, target = run.config, run.target
     roles = run.split.roles
     model = model_spec(model_bytes, OPSET, provider)
-    # Use all train and fit frames even if the run used a share of them: these poses set the
-    # limits, and the unit in which scores are compared.
+    # The score's unit and the limits use all train and fit frames, even if the run used a share
+    # of them.
     known = target.coordinates(run.dataset.poses[np.concatenate([roles["train"], roles["fit"]])])
     return Draft(
         name=name,

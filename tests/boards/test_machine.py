@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 
-from boards.machine import ROOT, TEST_PACKAGES, SetUpError, requirements
+from boards.machine import BOARDS, ROOT, TEST_PACKAGES, SetUpError, requirements
 
 
 def test_requirements_are_those_of_the_project_without_the_oracles():
@@ -21,3 +21,12 @@ def test_a_missing_test_package_is_named():
     project = {"project": {"dependencies": [], "optional-dependencies": {"test": ["pytest>=8"]}}}
     with pytest.raises(SetUpError, match="hypothesis"):
         requirements(project)
+
+
+@pytest.mark.parametrize("board", BOARDS.values(), ids=lambda board: board.name)
+def test_every_test_of_a_board_exists(board):
+    for test in board.tests:
+        path, *names = test.partition("[")[0].split("::")
+        assert (ROOT / path).exists(), test
+        for name in names:
+            assert f"def {name}(" in (ROOT / path).read_text("utf-8"), test

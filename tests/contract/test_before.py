@@ -1,6 +1,6 @@
-"""Bundles of the first format yield the numbers they were published with.
+"""Pre-release bundles yield the numbers they were published with.
 
-``data/before_0.1.json`` holds thresholds and estimates of the four demonstration bundles on the
+``data/pre_release.json`` holds thresholds and estimates of the four demonstration bundles on the
 first frames of the demonstration clip, computed by the code that published them.
 """
 
@@ -12,7 +12,7 @@ import pytest
 
 from cvo_edge import Odometer, open_source, read_bundle
 
-BEFORE = json.loads((Path(__file__).parent / "data/before_0.1.json").read_bytes())
+BEFORE = json.loads((Path(__file__).parent / "data/pre_release.json").read_bytes())
 # Kernels of other processors round differently; a wrong rule would be off by far more.
 TOLERANCE = 1e-4
 

@@ -28,8 +28,8 @@ from cvo_edge.output.records import header_of
 from cvo_edge.output.sinks import Sink
 from cvo_edge.sets import unbounded_set
 
-# Written by version 0.1.0, before headers existed.
-OLD = Path(__file__).parent / "old_records"
+# Pre-release records, written before headers existed.
+OLD = Path(__file__).parent / "pre_release_records"
 OLD_JSON_LINES = sorted(OLD.glob("*.jsonl"))
 
 

@@ -11,8 +11,8 @@ from fuzz.trials import Ended
 SHORT = {
     "models": 24,
     "models_that_fit": 8,
-    "artifacts": 400,
-    "artifacts_that_fit": 6,
+    "calibrations": 400,
+    "calibrations_that_fit": 6,
     "kills": 4,
     "sensors": 200,
     "recordings": 40,
@@ -26,8 +26,8 @@ SEEN = {
     # An invalid model, which is reached only if the digests fit.
     "models_that_fit": "exit code 4",
     "kills": "whole",
-    "artifacts": "exit code 3",
-    "artifacts_that_fit": "exit code 3",
+    "calibrations": "exit code 3",
+    "calibrations_that_fit": "exit code 3",
     "sensors": "frozen, degraded",
     "images": "invalid",
     "videos": "exit code 6",
@@ -51,15 +51,15 @@ def test_nothing_is_found(kind):
 
 
 @pytest.mark.parametrize("word", ["models=0", "kills=-5", "images=x", "nothing"])
-def test_what_tries_nothing_is_refused(monkeypatch, word):
+def test_invalid_names_and_counts_are_refused(monkeypatch, word):
     monkeypatch.setattr("sys.argv", ["fuzz", word])
     assert main() == 2
 
 
-def test_what_would_be_a_finding_is_one(monkeypatch, artifacts_dir):
+def test_disabled_checks_lead_to_findings(monkeypatch, artifacts_dir):
     # A reader that checks no digests accepts everything.
     monkeypatch.setattr(bundles, "read_bundle", lambda _: None)
-    assert len(bundles.models(4).findings) == len(bundles.artifacts(4).findings) == 4
+    assert len(bundles.models(4).findings) == len(bundles.calibrations(4).findings) == 4
     # Without frame checks, every faulted frame gets an interval.
     monkeypatch.setattr("cvo_edge.engine.observation.image_doubt", lambda _: None)
     monkeypatch.setattr("cvo_edge.input.frame_checks.StreamChecks.doubts", lambda *_: ())

@@ -21,7 +21,7 @@ from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
 
-# Coverage bands: exact, valid only if frames were independent draws, or not given.
+# Status of a coverage band: exact, indicative (frames are correlated), or no band.
 Claim = Literal["exact", "indicative", "none"]
 # Probability with which the coverage of a valid method lies within the band.
 _BAND_PROBABILITY = 0.99

@@ -1,4 +1,4 @@
-"""Compute thresholds from scores of the exported model, run through the runtime.
+"""Run the exported model in the runtime, compute scores and derive thresholds.
 
 Coverage then does not depend on the fidelity of the export: the graph that runs on the device,
 8-bit or not, is the graph that was calibrated.
@@ -34,7 +34,7 @@ from cvo_export.datasets import PoseDataset
 Array = NDArray[np.float64]
 
 
-# Least relative gain on val for choosing another score; smaller differences may be chance.
+# Margin by which another score must win on val; smaller differences may be chance.
 _CLEARLY = 0.05
 
 

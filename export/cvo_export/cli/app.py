@@ -71,7 +71,7 @@ TrainingSplitOption = Annotated[
 RuleOption = Annotated[
     Rule | None,
     typer.Option(
-        help="Unit of a calibration draw: a frame (pooled) or a sequence (hierarchical); "
+        help="Unit of exchangeability: frame (pooled) or sequence (hierarchical); "
         "default: hierarchical for a split by sequence, otherwise pooled."
     ),
 ]

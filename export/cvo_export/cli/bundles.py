@@ -32,7 +32,7 @@ def publish(
     run_dir: Annotated[Path, typer.Argument(help="A finished run.", show_default=False)],
     bundle: Annotated[Path, typer.Argument(help="Bundle folder to write.", show_default=False)],
     precision: Annotated[
-        Precision, typer.Option(help="int8: an 8-bit backbone with its own thresholds.")
+        Precision, typer.Option(help="int8: quantise the backbone and calibrate it separately.")
     ] = "fp32",
     provider: Annotated[
         Provider, typer.Option(help="Engine that the bundle is calibrated for and runs on.")
@@ -93,7 +93,7 @@ def calibrate(
         typer.Option(help="ONNX file: chart of its bounds; default: tangent_predicted."),
     ] = None,
     crop: Annotated[
-        Crop | None, typer.Option(help="ONNX file: part of the image it sees; default: none.")
+        Crop | None, typer.Option(help="ONNX file: crop applied to the image; default: none.")
     ] = None,
     new_data: Annotated[
         bool,

@@ -85,7 +85,7 @@ def _read_camera(path: Path) -> tuple[Intrinsics | None, Array]:
     text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
     try:
         document: Any = yaml.safe_load(text)
-    # An impossible date raises ValueError, and endless brackets raise RecursionError.
+    # Invalid dates raise ValueError, and deeply nested brackets raise RecursionError.
     except (yaml.YAMLError, ValueError, RecursionError):
         document = None
     if not isinstance(document, dict):

@@ -34,7 +34,7 @@ Feed = Mapping[str, NDArray[np.generic]]
 # An activation after a convolution is folded into the range of its output, at no cost.
 _QUANTISED_KINDS = ("Conv", "Add", "MaxPool", "Relu", "Clip")
 
-# Largest int8 weight; symmetric about zero.
+# Largest int8 weight, symmetric about zero.
 _LARGEST_STEP = 127
 _LEAST_WEIGHT = 1e-8
 

@@ -110,7 +110,7 @@ class Backbone(nn.Module):
                 f"stages: expected some of {', '.join(dict.fromkeys(strides))} for "
                 f"{self.config.name}, or {FINAL} alone, found {', '.join(unknown) or 'no stage'}"
             )
-        # Of several stages with the same stride, use the deepest.
+        # If several stages have the same stride, use the deepest one.
         last = {stride: index for index, stride in enumerate(strides)}
         indices = sorted(last[stage] for stage in self.config.stages)
         self.body.prune_intermediate_layers(indices=indices, prune_head=True)
