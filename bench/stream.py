@@ -215,13 +215,13 @@ def main() -> None:
             )
         for name, row in results[backbone]["camera"].items():
             print(
-                f"{backbone:<16} {name:<17} {row['cpu_ms_per_frame']['median']:7.2f} CPU-ms a "
+                f"{backbone:<16} {name:<17} {row['cpu_ms_per_frame']['median']:7.2f} CPU-ms per "
                 f"frame at {FPS}, {row['over_onnxruntime']['median']:.3f} of onnxruntime's",
                 flush=True,
             )
         for name, rows in results[backbone]["neighbour"].items():
             line = ", ".join(f"{call}: {row['median']:.2f}" for call, row in rows.items())
-            print(f"{backbone:<16} {name:<17} ms a step, mode and threads: {line}", flush=True)
+            print(f"{backbone:<16} {name:<17} ms per step, mode and threads: {line}", flush=True)
     write_report(
         "stream", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP, fps=FPS, method=METHOD
     )

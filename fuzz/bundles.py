@@ -1,4 +1,4 @@
-"""Bundles with mutated files: with the original digests, and with digests made to fit."""
+"""Mutated models and calibration files, with original or recomputed digests."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, ModelError
 from cvo_edge.input.preprocess import model_input, selftest_image
 from fuzz.mutate import Generator, changed_bytes, changed_document, with_digest
-from fuzz.trials import Tally, beside_each_other, command
+from fuzz.trials import Tally, command, in_parallel
 
 ARTIFACTS = Path(__file__).resolve().parent.parent / "calibration_artifacts"
 # The smallest bundle of each method, quantised, and a float32 bundle for the other operators.
 BUNDLES = tuple(
     ARTIFACTS / f"synthetic-room-{name}" for name in ("cjp-int8", "csp-int8", "mcqr-int8", "cjp")
 )
-# Permitted exit codes for a bundle whose digests fit: 0 if it passes its self-test, otherwise the
+# Accepted exit codes of a bundle with matching digests: 0 if it passes its self-test, otherwise the
 # codes for invalid files and for a failed self-test.
 _PERMITTED = (0, 3, 4, 5, 8)
 
@@ -51,7 +51,7 @@ def models(count: int) -> Tally:
             path.write_bytes(changed_bytes(path.read_bytes(), generator))
             return _refused(bundle, (BundleMismatchError, ModelError))
 
-    return beside_each_other(trial, count)
+    return in_parallel(trial, count)
 
 
 def calibrations(count: int) -> Tally:
@@ -64,7 +64,7 @@ def calibrations(count: int) -> Tally:
             path.write_bytes(content)
             return _refused(bundle, (CalibrationFileError,))
 
-    return beside_each_other(trial, count)
+    return in_parallel(trial, count)
 
 
 def _refused(bundle: Path, expected: tuple[type[CvoError], ...]) -> tuple[str, str | None]:
@@ -92,7 +92,7 @@ def models_that_fit(count: int) -> Tally:
             calibration.write_bytes(with_digest(json.dumps(document).encode()))
             return _verified(bundle)
 
-    return beside_each_other(trial, count)
+    return in_parallel(trial, count)
 
 
 def calibrations_that_fit(count: int) -> Tally:
@@ -105,7 +105,7 @@ def calibrations_that_fit(count: int) -> Tally:
             path.write_bytes(with_digest(content))
             return _verified(bundle)
 
-    return beside_each_other(trial, count)
+    return in_parallel(trial, count)
 
 
 def _changed(

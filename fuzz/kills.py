@@ -14,7 +14,7 @@ import numpy as np
 from cvo_edge.errors import SourceError
 from cvo_edge.output.records import read_records
 from fuzz.bundles import ARTIFACTS
-from fuzz.trials import Tally, beside_each_other
+from fuzz.trials import Tally, in_parallel
 
 BUNDLE, CLIP = ARTIFACTS / "synthetic-room-cjp-int8", ARTIFACTS / "synthetic-room-clip"
 _PROGRAM = "from cvo_edge.__main__ import main; main()"
@@ -39,7 +39,7 @@ def kills(count: int) -> Tally:
                     return "ended", f"ended with exit code {code} before it was killed"
         return "ended", "ended before it was killed, in every attempt"
 
-    return beside_each_other(trial, count)
+    return in_parallel(trial, count)
 
 
 def _killed(path: Path, generator: np.random.Generator) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fuzz.bundles import ARTIFACTS
 from fuzz.mutate import changed_bytes
-from fuzz.trials import Tally, beside_each_other, command
+from fuzz.trials import Tally, command, in_parallel
 
 _BUNDLE, _CLIP = ARTIFACTS / "synthetic-room-cjp-int8", ARTIFACTS / "synthetic-room-clip"
 _SUFFIXES = (".jpg", ".png", ".bmp", ".ppm", ".tif", ".webp")
@@ -28,7 +28,7 @@ def images(count: int) -> Tally:
     Each changed file is one trial.
     """
     tally = Tally()
-    for found in beside_each_other(_folder_of_images, -(-count // _MANY)).outcomes.elements():
+    for found in in_parallel(_folder_of_images, -(-count // _MANY)).outcomes.elements():
         outcomes, finding = json.loads(found)
         for outcome, number in outcomes.items():
             for _ in range(number):
@@ -96,7 +96,7 @@ def videos(count: int) -> Tally:
             finding = ended.misbehaviour((0, 6)) or _out_of_order(ended.output)
             return f"exit code {ended.code}", finding
 
-    return beside_each_other(trial, count)
+    return in_parallel(trial, count)
 
 
 def _out_of_order(output: bytes) -> str | None:

@@ -135,7 +135,7 @@ def _places(node: Any) -> Any:  # noqa: ANN401 - any JSON value
 
 
 def with_digest(content: bytes) -> bytes:
-    """Return ``calibration.json`` with a matching digest, if it still has a digest field."""
+    """Return ``calibration.json`` with its digest recomputed, if it still has a digest key."""
     start = content.find(b'"digest": "')
     if start < 0:
         return content

@@ -32,7 +32,7 @@ _BUNDLES = tuple(
 )
 # Height and width of the bundles' model input.
 _MODEL_SIZE = (192, 256)
-# Largest permitted share of flagged clean frames.
+# Largest accepted fraction of flagged clean frames.
 _FALSE_ALARMS = 0.01
 # Sensor noise, in grey levels, that makes all frames different.
 _NOISE = 2.0

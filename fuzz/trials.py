@@ -72,7 +72,7 @@ def command(arguments: Sequence[object], timeout_s: float = 120.0) -> Ended:
     return Ended(done.returncode, done.stdout, errors, time.monotonic() - begin)
 
 
-def beside_each_other(trial: Callable[[int], tuple[str, str | None]], count: int) -> Tally:
+def in_parallel(trial: Callable[[int], tuple[str, str | None]], count: int) -> Tally:
     """Run numbered trials in parallel, one per core; each returns an outcome and a finding."""
     tally, begin = Tally(), time.monotonic()
     with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -1,4 +1,4 @@
-"""The comparison: each cell runs once, with results that do not depend on the process."""
+"""The comparison: each cell runs once, with the same figures for any number of workers."""
 
 import json
 import shutil

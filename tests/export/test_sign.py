@@ -197,7 +197,7 @@ def test_processes_at_once_keep_the_highest(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["none", "text", "private", "another curve"])
-def test_what_is_no_ed25519_public_key_is_refused(copied_bundle, keys, tmp_path, kind):
+def test_anything_but_an_ed25519_public_key_is_refused(copied_bundle, keys, tmp_path, kind):
     path = tmp_path / "key.pem"
     if kind == "text":
         path.write_text("no key")

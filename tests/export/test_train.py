@@ -1,4 +1,4 @@
-"""Training: reproducible, bit-identical after resuming, and never mixing two runs."""
+"""Training: reproducible, bit-identical after resuming, and refuses files of another run."""
 
 import shutil
 
