@@ -128,7 +128,7 @@ $(RELEASE_VENV)/.installed: constraints/release.txt
 # From the last commit, not from the working tree; the same commit gives the same bytes.
 release: export SOURCE_DATE_EPOCH = $(shell git log -1 --format=%ct)
 release: SOURCE := build/release/source
-release: VERSION = $(shell git show HEAD:cvo_edge/__init__.py | sed -n 's/^__version__ = "\(.*\)"/\1/p')
+release: VERSION = $(shell git show HEAD:cvo_edge/vocabulary.py | sed -n 's/^VERSION = "\(.*\)"/\1/p')
 release: $(RELEASE_VENV)/.installed ## build wheels and sdists of both packages, SBOMs and checksums into dist/
 	rm -rf build/release dist
 	mkdir -p $(SOURCE) build/release/sdist dist

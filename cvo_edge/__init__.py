@@ -12,6 +12,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from cvo_edge.vocabulary import VERSION
+
 if TYPE_CHECKING:
     from cvo_edge.bundle.format import Calibration
     from cvo_edge.engine.loading import Bundle, read_bundle
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
     from cvo_edge.pose import Chart, Pose
     from cvo_edge.sets import ConformalSet, Ellipsoids
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 __all__ = [
     "Bundle",

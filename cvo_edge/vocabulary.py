@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
+# Of this package, for its records and its metadata.
+VERSION = "0.1.0"
+
 Scope = Literal["marginal", "joint"]
 Mode = Literal["live", "latency", "throughput"]
 Format = Literal["jsonl", "csv", "tum", "table"]

@@ -11,12 +11,11 @@ from typing import Literal
 import msgspec
 from msgspec import Struct
 
-from cvo_edge import __version__
 from cvo_edge.bundle.format import Calibration, Quaternion
 from cvo_edge.errors import SourceError
 from cvo_edge.estimate import Record
 from cvo_edge.pose import Chart, Rotation
-from cvo_edge.vocabulary import Precision, Provider, Scope
+from cvo_edge.vocabulary import VERSION, Precision, Provider, Scope
 
 Stamps = Literal["fps", "arrival"]
 
@@ -76,7 +75,7 @@ def header_of(
     """Return the header for records of one bundle at one confidence and scope."""
     model, pose, reference = calibration.model, calibration.pose, chart.reference_q_xyzw
     return Header(
-        software=f"cvo-edge {__version__}",
+        software=f"cvo-edge {VERSION}",
         bundle=calibration.name,
         method=calibration.method,
         digest=calibration.digest,
