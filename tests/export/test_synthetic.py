@@ -90,8 +90,8 @@ def test_opening_paints_nothing():
         ("room,size=320x240x3", "64x48 and 1920x1080", "size=320x240x3"),
         ("room,seed=-1", "seed=0..4294967295", "seed=-1"),
         ("room,seed=4294967296", "seed=0..4294967295", "seed=4294967296"),
-        ("room,seed=1,seed=1", "seed once", "again"),
-        ("room,size=64x48,size=64x48", "size once", "again"),
+        ("room,seed=1,seed=1", "seed once", "twice"),
+        ("room,size=64x48,size=64x48", "size once", "twice"),
     ],
 )
 def test_bad_specification_is_refused(spec, expected, found):
