@@ -125,7 +125,14 @@ def main() -> None:
         print(method, results[method], flush=True)
     write_result(
         RESULTS / "speed" / "against.json",
-        {"other_commit": commit, "rounds": rounds, "frames_a_turn": FRAMES, "results": results},
+        {
+            # The other checkout's folder says nothing; its commit does.
+            "command": f"python bench/against.py OTHER_CHECKOUT {rounds}",
+            "other_commit": commit,
+            "rounds": rounds,
+            "frames_a_turn": FRAMES,
+            "results": results,
+        },
     )
 
 

@@ -218,6 +218,19 @@ def board(figures: dict[str, Any]) -> Rows:
             ]
 
 
+def against(results: dict[str, Any]) -> Rows:
+    """Array to interval of two checkouts."""
+    other = "of the other checkout"
+    yield ["method", "/ raw call", other, "- raw call, ms", other]
+    for method, found in results.items():
+        both = (found["this"], found["other"])
+        yield [
+            method,
+            *(number(one["ratio_to_raw"], 3) for one in both),
+            *(number(one["around_the_network_ms"]) for one in both),
+        ]
+
+
 # Program -> the tables of its results.
 _TABLES: dict[str, tuple[Callable[[dict[str, Any]], Rows], ...]] = {
     "frame": (frame, precision),
@@ -227,6 +240,7 @@ _TABLES: dict[str, tuple[Callable[[dict[str, Any]], Rows], ...]] = {
     "uncertainty_peers": (uncertainty,),
     "scaling": (scaling, confidences),
     "soak": (memory,),
+    "against": (against,),
 }
 
 

@@ -117,47 +117,49 @@ def test_a_reader_that_leaves_ends_it_quietly(bundle_dir, clip_dir):
         process.stdout.readline()
         process.stdout.close()
         assert process.stderr.read() == b""
-        assert process.wait(60) == 0
+        assert process.wait() == 0
 
 
-@pytest.mark.parametrize("delay_s", [0.1, 0.2, 0.25, 0.3, 0.35, 0.5])
-def test_a_signal_while_it_starts_is_no_defect(bundle_dir, delay_s):
+@pytest.mark.parametrize("library", ["libc", "msgspec", "numpy", "cv2", "onnxruntime"])
+def test_a_signal_while_it_starts_is_no_defect(bundle_dir, library):
     """A signal during an import surfaces as another error of the imported module."""
     command = [*FOREGROUND, "bench", str(bundle_dir), "--frames", "1000000"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        time.sleep(delay_s)
+        while library not in Path(f"/proc/{process.pid}/maps").read_text():
+            assert process.poll() is None
         process.send_signal(signal.SIGTERM)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate()
     # Before our code runs, Python's default action applies.
     assert process.returncode in (143, -signal.SIGTERM)
     assert said == ""
 
 
+@pytest.fixture(scope="module")
+def many_frames(clip_dir, tmp_path_factory):
+    """Links to one image: a source of a minute or more."""
+    frames = tmp_path_factory.mktemp("frames")
+    image = min(clip_dir.glob("*.color.jpg"))
+    for index in range(20_000):
+        (frames / f"{index}.jpg").symlink_to(image)
+    return frames
+
+
 @pytest.mark.parametrize("mode", ["latency", "throughput", "live"])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_it_with_every_record_whole(
-    bundle_dir, clip_dir, tmp_path, number, code, mode
+    bundle_dir, many_frames, tmp_path, number, code, mode
 ):
-    # Links to one image make a source long enough to be interrupted.
-    image = next(iter(sorted(clip_dir.glob("*.color.jpg"))))
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    for index in range(20_000):
-        os.link(image, frames / f"{index}.jpg") if index < 2 else (
-            frames / f"{index}.jpg"
-        ).symlink_to(image)
     out = tmp_path / "out.jsonl"
     options = ["-o", str(out), "--quiet", "--mode", mode, "--fps", "50"]
     with subprocess.Popen(
-        [*FOREGROUND, "run", str(bundle_dir), str(frames), *options],
+        [*FOREGROUND, "run", str(bundle_dir), str(many_frames), *options],
         stderr=subprocess.PIPE,
     ) as process:
-        deadline = time.monotonic() + 60
         while not (out.exists() and out.stat().st_size > 5000):
-            assert time.monotonic() < deadline
+            assert process.poll() is None
             time.sleep(0.01)
         process.send_signal(number)
-        assert process.wait(10) == code
+        assert process.wait() == code
         assert process.stderr.read() == b""
     content = out.read_text()
     assert content.endswith("\n")
@@ -218,7 +220,7 @@ def test_a_slow_reader_is_waited_for_also_where_another_process_would_not(bundle
         with os.fdopen(receiver, "rb") as stream:
             time.sleep(2.0)
             lines = stream.readlines()
-        assert process.wait(60) == 0, process.stderr.read()
+        assert process.wait() == 0, process.stderr.read()
     assert len(lines) == 1 + 40
 
 
@@ -267,7 +269,7 @@ def test_bench_of_a_source_without_frames_ends(bundle_dir, tmp_path):
     path = tmp_path / "empty.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (64, 48))
     writer.release()
-    refused(cvo_edge("bench", bundle_dir, path, timeout=60), 6)
+    refused(cvo_edge("bench", bundle_dir, path), 6)
 
 
 def test_exit_2_for_what_cannot_be_asked(bundle_dir, clip_dir):
@@ -532,8 +534,10 @@ def test_two_runs_do_not_write_one_file(bundle_dir, clip_dir, tmp_path):
         while not (output.exists() and output.stat().st_size):
             assert first.poll() is None
             time.sleep(0.01)
+        first.send_signal(signal.SIGSTOP)
         refused(cvo_edge("run", bundle_dir, clip_dir, "-o", output), 7)
-        assert first.wait(60) == 0
+        first.send_signal(signal.SIGCONT)
+        assert first.wait() == 0
     assert [record.status for record in read_records(output)]
     assert cvo_edge("run", bundle_dir, clip_dir, "-o", output, "--quiet").returncode == 0
 
@@ -586,9 +590,10 @@ def test_a_signal_ends_it_where_no_python_runs(bundle_dir, tmp_path, number):
     with subprocess.Popen(
         [*FOREGROUND, "run", str(bundle_dir), str(tmp_path)], stdout=subprocess.DEVNULL
     ) as process:
-        time.sleep(4.0)
-        assert process.poll() is None
-        begin = time.monotonic()
+        # Processor time, of which the start takes about one second.
+        while sum(map(int, Path(f"/proc/{process.pid}/stat").read_text().split()[13:15])) < 400:
+            assert process.poll() is None
+            time.sleep(0.01)
         process.send_signal(number)
-        assert process.wait(30) == 128 + number
-        assert time.monotonic() - begin < 1.0
+        # All pictures would take longer than a test may last.
+        assert process.wait() == 128 + number
