@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 
 from cvo_export.data.augment import AugmentConfig
+from cvo_export.datasets import synthetic
 from cvo_export.networks.backbone import BackboneConfig
 from cvo_export.networks.heads.cjp import CjpConfig
 from cvo_export.publish import publish
@@ -42,6 +44,25 @@ def tiny_config(**changes: Any) -> TrainConfig:
 
 def ignore_progress(stage: str, done: int, total: int, note: str = "") -> None:
     """Discard progress reports."""
+
+
+_PICTURES: dict[Any, Any] = {}
+
+
+@pytest.fixture(scope="module")
+def drawn_once() -> Iterator[None]:
+    """Draw each picture of the scene once, for modules that train on the same scene many times."""
+    draw = synthetic._Flight.photograph
+
+    def photograph(flight: Any, frame: int, intrinsics: Any, size: tuple[int, int]) -> Any:
+        key = (flight._entropy, frame, size)
+        if key not in _PICTURES:
+            _PICTURES[key] = draw(flight, frame, intrinsics, size)
+        return _PICTURES[key].copy()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic._Flight, "photograph", photograph)
+        yield
 
 
 @pytest.fixture(scope="session")
