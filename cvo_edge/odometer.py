@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Threshold
+from cvo_edge.camera import Camera
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.engine.observation import Observation, Observer
@@ -69,11 +70,15 @@ class Odometer:
     scope
         ``marginal``: the confidence holds for each degree of freedom; ``joint``: for all six at
         once.
+    camera
+        The camera that takes the images, if it is not the bundle's own; only methods that solve
+        for the pose use it.
 
     Raises
     ------
     UsageError
-        A confidence that is not stored, or an unknown scope or mode.
+        A confidence that is not stored, an unknown scope or mode, or a camera given to a method
+        that does not use it.
     ModelError, BundleMismatchError
         The engine refuses the model.
     """
@@ -86,6 +91,7 @@ class Odometer:
         mode: str = "latency",
         confidence: float = 0.9,
         scope: Scope = "marginal",
+        camera: Camera | None = None,
     ) -> None:
         calibration = bundle.calibration
         self.calibration = calibration
@@ -97,12 +103,18 @@ class Odometer:
         settings = plan(self.mode, threads)
         self._workers = settings.workers
         self.threads = settings.threads * settings.workers
+        if camera is not None and not bundle.head.solves:
+            raise UsageError(
+                f"camera: expected a method that solves for the pose, found {calibration.method}, "
+                "whose network learned one camera; omit it"
+            )
         self._observer = Observer(
             bundle.model,
             calibration.model,
             calibration.preprocess,
             calibration.pose,
             bundle.head,
+            camera or calibration.camera,
             threads=settings.threads,
             spinning=settings.spinning,
             at_once=settings.workers,
@@ -122,6 +134,7 @@ class Odometer:
         mode: str = "latency",
         confidence: float = 0.9,
         scope: Scope = "marginal",
+        camera: Camera | None = None,
         cache: ModelCache | None = None,
         public_key: str | os.PathLike[str] | None = None,
     ) -> Odometer:
@@ -148,6 +161,7 @@ class Odometer:
                 mode=mode,
                 confidence=confidence,
                 scope=scope,
+                camera=camera,
             )
 
         try:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import msgspec
 from msgspec import Meta, Struct
 
+from cvo_edge.camera import Camera
 from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.pose import Rotation
 from cvo_edge.vocabulary import Crop, Joint, Precision, Provider, Rule, Scope, SplitKind
@@ -179,8 +180,12 @@ class Provenance(_Strict, frozen=True):
     options: dict[Text, Text | int | float | bool | None]
 
 
-class Calibration(_Strict, frozen=True):
-    """The contents of ``calibration.json``, version 1."""
+class Calibration(_Strict, frozen=True, omit_defaults=True):
+    """The contents of ``calibration.json``, version 1.
+
+    ``camera``: intrinsics of the calibration images' camera; null if the data set does not state
+    them.
+    """
 
     schema_version: Literal[1]
     name: Text
@@ -194,6 +199,7 @@ class Calibration(_Strict, frozen=True):
     selftest: SelfTest
     provenance: Provenance
     digest: Sha256
+    camera: Camera | None = None
 
     def threshold(self, confidence: float, scope: Scope) -> Threshold | None:
         """Return the stored threshold for this confidence and scope, or None.

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import MAX_NUMBER, ModelSpec, PoseSpec, PreprocessSpec
+from cvo_edge.camera import Camera
 from cvo_edge.engine.loading import open_session
 from cvo_edge.engine.model_cache import CachedModel
 from cvo_edge.engine.session import Session
@@ -30,6 +31,8 @@ Array = NDArray[np.float64]
 
 # Up to this size, a plain Python loop is faster than the first numpy call.
 _FEW = 64
+_NO_POSE = np.full(7, np.nan)
+_NO_POSE.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +42,7 @@ class Observation:
     Attributes
     ----------
     outputs
-        Model outputs by name, each with a leading axis of one.
+        Model outputs by name, and what the method's solver adds, each with a leading axis of one.
     pose, point
         Shape (7,) with a unit quaternion, and shape (6,): the same pose in the bundle's chart.
     fault
@@ -70,7 +73,9 @@ class Observer:
     spec, inputs, pose
         The calibration's description of the model, its input and the poses.
     head
-        The method, which may need inputs besides the image.
+        The method, which may need inputs besides the image, and may solve for the pose.
+    camera
+        The camera that takes the images; None if its intrinsics are unknown.
     threads
         Threads of one inference; all allowed cores by default.
     spinning
@@ -91,6 +96,7 @@ class Observer:
         inputs: PreprocessSpec,
         pose: PoseSpec,
         head: Head,
+        camera: Camera | None = None,
         *,
         threads: int | None = None,
         spinning: bool = True,
@@ -101,6 +107,11 @@ class Observer:
         )
         self._inputs = inputs
         self._head = head
+        self._solver = head.solver(camera, inputs)
+        # Only a solver depends on the camera's shape.
+        self._shape = None
+        if self._solver is not None and camera is not None:
+            self._shape = camera.height, camera.width
         reference = None if pose.reference_q_xyzw is None else np.array(pose.reference_q_xyzw)
         absolute = pose.rotation == "tangent_reference"
         self.chart = Chart(pose.rotation, reference if absolute else None)
@@ -157,25 +168,31 @@ class Observer:
         tensor = preprocess.model_input(image, inputs.height, inputs.width, inputs.crop)
         look = Look(tensor, (image.shape[0], image.shape[1]))
         doubt = image_doubt(look)
+        if doubt is None and self._shape is not None and not similar(look.size, self._shape):
+            doubt = Reason.CAMERA_DIFFERS
         ready = perf_counter()
+        outputs: Mapping[str, NDArray[Any]]
         outputs = session.run({"image": tensor, **self._head.extra_inputs(seq)})
+        fault = _output_fault(outputs)
+        if self._solver is not None and fault is None:
+            outputs, unsure = self._solver(outputs)
+            doubt = doubt or unsure
         done = perf_counter()
-        pose, point, fault = self._checked(outputs)
+        pose, point, fault = self._checked(outputs, fault)
         spent_ms = 1e3 * (ready - start), 1e3 * (done - ready)
         return Observation(outputs, pose, point, fault, doubt, look, *spent_ms)
 
     def _checked(
-        self, outputs: Mapping[str, NDArray[np.float32]]
+        self, outputs: Mapping[str, NDArray[Any]], fault: Reason | None
     ) -> tuple[Array, Array, Reason | None]:
-        """Outputs -> unit pose (7,), point (6,), and the fault or None.
+        """Outputs and their fault -> unit pose (7,), point (6,), and the fault or None.
 
         For so few numbers plain Python is faster than numpy, whose code the inference has just
         evicted from the processor's caches.
         """
+        if fault is Reason.OUTPUT_NOT_FINITE or "pose" not in outputs:
+            return _NO_POSE, _NO_POSE[:6], fault
         values = outputs["pose"][0].tolist()
-        sensible = all(map(_sensible, outputs.values()))
-        if not sensible and not all(np.isfinite(output).all() for output in outputs.values()):
-            return np.array(values), np.array(values[:6]), Reason.OUTPUT_NOT_FINITE
         length = math.hypot(*values[3:])
         # Normalised, with the sign that gives qw >= 0.
         scale = math.copysign(length, values[6]) if length > 0.0 else math.nan
@@ -190,9 +207,21 @@ class Observer:
                 self._limits.lowest, plausible.tolist(), self._limits.highest, strict=True
             )
         )
-        if not inside:
-            return pose, point, Reason.POSE_IMPLAUSIBLE
-        return pose, point, None if sensible else Reason.OUTPUT_ABSURD
+        return pose, point, fault if inside else Reason.POSE_IMPLAUSIBLE
+
+
+def similar(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether images of two sizes (height, width) have the same shape, to half a pixel."""
+    slack = 0.5 * max(*size, *other)
+    return abs(size[0] * other[1] - size[1] * other[0]) <= slack
+
+
+def _output_fault(outputs: Mapping[str, NDArray[Any]]) -> Reason | None:
+    if all(map(_sensible, outputs.values())):
+        return None
+    if all(np.isfinite(output).all() for output in outputs.values()):
+        return Reason.OUTPUT_ABSURD
+    return Reason.OUTPUT_NOT_FINITE
 
 
 def _sensible(output: NDArray[np.float32]) -> bool:
@@ -205,4 +234,4 @@ def _sensible(output: NDArray[np.float32]) -> bool:
 
 
 def _faulty(reason: Reason) -> Observation:
-    return Observation({}, np.full(7, np.nan), np.full(6, np.nan), reason)
+    return Observation({}, _NO_POSE, _NO_POSE[:6], reason)

@@ -10,8 +10,12 @@ from cvo_edge.heads.base import Candidate, Head
 from cvo_edge.heads.cjp import CjpHead
 from cvo_edge.heads.cqr import CqrHead
 from cvo_edge.heads.csp import CspHead
+from cvo_edge.heads.fused import FusedHead
 from cvo_edge.heads.mcqr import McqrHead
+from cvo_edge.heads.scr import ScrHead
 
 __all__ = ["HEADS", "Candidate", "Head"]
 
-HEADS: dict[str, type[Head]] = {head.method: head for head in (CjpHead, CqrHead, CspHead, McqrHead)}
+HEADS: dict[str, type[Head]] = {
+    head.method: head for head in (CjpHead, CqrHead, CspHead, McqrHead, ScrHead, FusedHead)
+}

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Threshold
+from cvo_edge.bundle.format import PreprocessSpec, Threshold
+from cvo_edge.camera import Camera
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
+from cvo_edge.estimate import Reason
 from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import Joint, Scope
 
@@ -24,6 +26,16 @@ class Candidate(NamedTuple):
 
     score: str
     parameters: Struct
+
+
+class Solved(NamedTuple):
+    """A frame's outputs with what a solver adds, and why no interval may be claimed, or None."""
+
+    outputs: Mapping[str, NDArray[Any]]
+    doubt: Reason | None
+
+
+Solver = Callable[[Mapping[str, NDArray[Any]]], Solved]
 
 
 class Head(ABC):
@@ -55,6 +67,8 @@ class Head(ABC):
     score_names: ClassVar[tuple[str, ...]]
     # Whether the joint scope has a single score for all six degrees of freedom.
     one_joint_score: ClassVar[bool] = False
+    # Whether the pose comes from a solver that knows the camera, instead of from the network.
+    solves: ClassVar[bool] = False
     # For reports: the kind of set that the joint scope has.
     set_kind: ClassVar[str] = "each degree of freedom"
     # For reports: why a threshold may be unbounded despite enough calibration frames.
@@ -82,6 +96,14 @@ class Head(ABC):
         """Return the model inputs besides the image for frame ``seq``; none by default."""
         return {}
 
+    def solver(self, camera: Camera | None, inputs: PreprocessSpec) -> Solver | None:
+        """Return the function that computes ``pose`` (1, 7) from one frame's model outputs.
+
+        The default is None, for networks that give the pose themselves. ``camera`` is the running
+        camera, None if its intrinsics are unknown. Raises UsageError if the method needs it.
+        """
+        return None
+
     def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
         """Return the marginal confidence of each side's threshold; None for an unbounded side."""
         return (confidence,)
@@ -108,6 +130,25 @@ class Head(ABC):
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Return the set {y : score(y) <= q_hat} of one frame; point (6,)."""
+
+    def tuned(
+        self,
+        val: Mapping[str, NDArray[Any]],
+        poses: Array,
+        known: Mapping[str, NDArray[Any]],
+    ) -> Struct:
+        """Return the parameters with what frames of the known place decide; by default unchanged.
+
+        Parameters
+        ----------
+        val, poses
+            Outputs of n val frames, stacked, and their true poses (n, 7): for choices.
+        known
+            Outputs of all val and cal frames: for limits, which must accept all of them, so that
+            none is left out of the calibration.
+        """
+        parameters: Struct = self.parameters
+        return parameters
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Return the scores that recalibration can choose from, the current one first."""

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.camera import Camera
 from cvo_edge.vocabulary import Crop
 
 Image = NDArray[np.uint8]
@@ -55,6 +56,12 @@ def crop_box(
     kept_width = max(1, min(image_width, image_height * width // height))
     top, left = (image_height - kept_height) // 2, (image_width - kept_width) // 2
     return top, top + kept_height, left, left + kept_width
+
+
+def input_camera(camera: Camera, height: int, width: int, crop: Crop) -> Camera:
+    """Return the camera whose images are the model's inputs, given the one that takes them."""
+    box = crop_box(camera.height, camera.width, height, width, crop)
+    return camera.cropped(*box).scaled(width, height)
 
 
 def halved(image: Image, height: int, width: int) -> Image:

@@ -19,6 +19,7 @@ from cvo_edge.programs.options import (
     RUNTIME,
     BundleArgument,
     CacheOption,
+    CameraOption,
     JsonOption,
     PublicKeyOption,
     ThreadsOption,
@@ -93,7 +94,7 @@ def run(
         bool,
         typer.Option(
             "--region",
-            help="Write the region's points into every record (mcqr, joint scope).",
+            help="Write the region into every record (mcqr, scr, fused; joint scope).",
             rich_help_panel=REPORT,
         ),
     ] = False,
@@ -124,6 +125,7 @@ def run(
         float | None,
         typer.Option(help="Stamp frames at this rate, from zero.", rich_help_panel="Input"),
     ] = None,
+    camera: CameraOption = None,
     max_frames: Annotated[
         int | None,
         typer.Option(
@@ -153,6 +155,7 @@ def run(
     public_key: PublicKeyOption = None,
 ) -> None:
     """Estimate a pose interval for every frame of a source."""
+    from cvo_edge.camera import read_camera
     from cvo_edge.ground_truth import open_ground_truth
     from cvo_edge.input.capture import shown
     from cvo_edge.input.sources import open_source
@@ -173,12 +176,13 @@ def run(
         mode=mode or ("live" if frames.live else "latency"),
         confidence=confidence,
         scope=scope,
+        camera=read_camera(camera) if camera else None,
         cache=_model_cache(cache),
         public_key=public_key,
     ) as odometer:
         if region and not odometer.has_region:
             raise UsageError(
-                f"--region: expected a bundle of mcqr and the joint scope, found "
+                f"--region: expected a bundle of mcqr, scr or fused and the joint scope, found "
                 f"{odometer.calibration.method} and {scope}"
             )
         summary = RunSummary(odometer.chart.dof, confidence, scope, with_truth=truth is not None)

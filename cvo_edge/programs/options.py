@@ -43,4 +43,14 @@ PublicKeyOption = Annotated[
         rich_help_panel=RUNTIME,
     ),
 ]
+CameraOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        help="JSON file with width, height, fx, fy, cx, cy of another camera (scr).",
+        readable=False,
+        show_default=False,
+        rich_help_panel="Input",
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -130,6 +130,7 @@ def calibrate(
         joint=joint,
         split=split.spec(dataset),
         dataset=dataset.name,
+        camera=dataset.camera() or draft.camera,
         model=msgspec.structs.replace(draft.model, provider=own),
         provenance=msgspec.structs.replace(draft.provenance, created_with=made),
     )
@@ -244,6 +245,7 @@ def _from_model(
             limits=limits,
             standard_deviation=deviation,
         ),
+        camera=dataset.camera(),
         provenance=Provenance(
             created_with=versions(_PACKAGES),
             seed=split.seed,

@@ -71,7 +71,11 @@ def evaluate(
     indices = subset_indices(calibration, dataset, subset)
     claim: Claim = "exact" if split is not None and split.kind == "random" else "indicative"
     with Odometer(
-        bundle, threads=threads, confidence=first.confidence, scope=first.scope
+        bundle,
+        threads=threads,
+        confidence=first.confidence,
+        scope=first.scope,
+        camera=dataset.camera() if bundle.head.solves else None,
     ) as odometer:
         seen = observe(odometer, dataset, indices)
         # Clean and noisy frames are not exchangeable, so no coverage can be claimed.

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal, Protocol
 
-Stage = Literal["features", "training", "fine-tuning"]
+Stage = Literal["features", "map", "training", "fine-tuning"]
 
 
 class Progress(Protocol):

@@ -188,6 +188,7 @@ def _draft(
                 "parity": float(f"{parity:.3g}"),
             },
         ),
+        camera=run.dataset.camera(),
         rule=rule,
         joint=joint,
         split=run.split.spec(run.dataset),

@@ -31,6 +31,7 @@ from cvo_edge.bundle.format import (
     Threshold,
 )
 from cvo_edge.bundle.reading import UNWRITTEN
+from cvo_edge.camera import Camera
 from cvo_edge.engine.observation import Observer
 from cvo_edge.engine.session import Session
 from cvo_edge.heads import HEADS, Candidate, Head
@@ -79,6 +80,8 @@ class Draft:
     ----------
     method
         Name of the runtime head.
+    camera
+        The camera of the calibration images; None if it is unknown.
     rule, joint, split, dataset
         How to compute the thresholds, and from which frames.
     """
@@ -89,6 +92,7 @@ class Draft:
     preprocess: PreprocessSpec
     pose: PoseSpec
     provenance: Provenance
+    camera: Camera | None
     rule: Rule
     joint: Joint
     split: SplitSpec
@@ -105,6 +109,7 @@ class Draft:
             preprocess=calibration.preprocess,
             pose=calibration.pose,
             provenance=calibration.provenance,
+            camera=calibration.camera,
             rule=source.rule,
             joint=source.joint,
             split=source.split,
@@ -122,7 +127,7 @@ class Draft:
 
     def observer(self, model_bytes: bytes, head: Head) -> Observer:
         """Return an observer that runs the network; raises ModelError and BundleMismatchError."""
-        return Observer(model_bytes, self.model, self.preprocess, self.pose, head)
+        return Observer(model_bytes, self.model, self.preprocess, self.pose, head, self.camera)
 
     def calibrated(
         self,
@@ -163,6 +168,7 @@ class Draft:
                 tolerance=_SELFTEST_TOLERANCE[self.model.precision],
             ),
             provenance=self.provenance,
+            camera=self.camera,
             digest=UNWRITTEN,
         )
 

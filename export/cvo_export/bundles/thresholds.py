@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -159,14 +159,36 @@ def calibrated(
     with draft.observer(model_bytes, first) as observer:
         val = observe(observer, dataset, roles["val"])
         cal = observe(observer, dataset, roles["cal"])
-        selftest = {
-            name: tuple(float(f"{value:.9g}") for value in values.reshape(-1).tolist())
-            for name, values in observe_selftest(observer, *SELFTEST_SIZE).outputs.items()
-        }
+    candidates = [
+        candidate._replace(
+            parameters=draft.head(candidate).tuned(
+                val.outputs, val.true_pose, known_outputs(val, cal)
+            )
+        )
+        for candidate in candidates
+    ]
     head = draft.head(chosen(draft, val, candidates))
+    with draft.observer(model_bytes, head) as observer:
+        if head.solves:
+            # What was tuned may have changed what the solver finds.
+            val = observe(observer, dataset, roles["val"])
+            cal = observe(observer, dataset, roles["cal"])
+        outputs = observe_selftest(observer, *SELFTEST_SIZE).outputs
+    selftest = {
+        spec.name: tuple(float(f"{value:.9g}") for value in outputs[spec.name].reshape(-1).tolist())
+        for spec in draft.model.outputs
+    }
     scored = cal.scored(head)
     found = thresholds(head, scored, val.scored(head), draft.rule, draft.joint)
     return draft.calibrated(head, found, counts(scored), selftest)
+
+
+def known_outputs(*observed: Observed) -> dict[str, NDArray[Any]]:
+    """Return the outputs of several roles, stacked."""
+    return {
+        name: np.concatenate([each.outputs[name] for each in observed])
+        for name in observed[0].outputs
+    }
 
 
 def with_thresholds(

@@ -1,22 +1,24 @@
-"""Augmentation with exact labels: camera rotations and changes of light.
+"""Augmentation with exact labels: rotations and zooms of the camera, light and motion blur.
 
 When a camera only rotates, the same rays pass through other pixels. With ``R' = R A`` (R the
 camera-to-world rotation, A a rotation in the camera frame), the new image is the old one warped by
-the homography K A^T K^-1, independently of the scene's depth. Position cannot be augmented this
-way.
+the homography K A^T K^-1, independently of the scene's depth; the pixels of a lens with distortion
+follow its model. Position cannot be augmented this way.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import geometry
-from cvo_edge.input import preprocess
-from cvo_export.datasets import Intrinsics
+from cvo_edge.camera import Camera
+from cvo_export.scene.sensor import streak
 
 Image = NDArray[np.uint8]
 
@@ -35,48 +37,79 @@ class AugmentConfig:
         Standard deviation of the rotation vector, per axis of the camera.
     light
         Scale of the changes of gain, gamma, colour, blur and noise; 0 disables them, 1 is normal.
+    motion_blur
+        Greatest length of the blur of every third copy, in percent of the image's width.
+    zoom
+        Greatest change of the focal length, as a logarithm; copies alternate between longer and
+        shorter ones. Only for methods that know each copy's camera.
     """
 
     rotation_deg: float = 6.0
     light: float = 1.0
+    motion_blur: float = 0.0
+    zoom: float = 0.0
 
     def graded(self, share: float) -> AugmentConfig:
         """Return a configuration with this share, 0 to 1, of the strength."""
-        return AugmentConfig(share * self.rotation_deg, share * self.light)
+        return AugmentConfig(
+            share * self.rotation_deg,
+            share * self.light,
+            share * self.motion_blur,
+            share * self.zoom,
+        )
+
+    def zooms(self, copies: int) -> tuple[float, ...]:
+        """Return the focal length of each copy as a multiple; the first, unchanged, has 1.
+
+        Every second copy keeps 1, too, for networks that learn one camera.
+        """
+        logs = [
+            0.0 if n % 2 else (n % 4 - 1.0) * self.zoom * n / max(1, copies)
+            for n in range(copies + 1)
+        ]
+        return tuple(math.exp(value) for value in logs)
 
 
-def model_intrinsics(
-    intrinsics: Intrinsics, image_shape: tuple[int, ...], height: int, width: int, crop: str
-) -> NDArray[np.float64]:
-    """Return the camera matrix K (3, 3) of the model input, from the camera image's intrinsics.
-
-    Pixel centres have integer coordinates, so scaling shifts the principal point by half pixels.
-    """
-    top, bottom, left, right = preprocess.crop_box(
-        image_shape[0], image_shape[1], height, width, "centre" if crop == "centre" else "none"
-    )
-    sx, sy = width / (right - left), height / (bottom - top)
-    K = np.eye(3)
-    K[0] = sx * intrinsics.fx, 0.0, sx * (intrinsics.cx - left + 0.5) - 0.5
-    K[1] = 0.0, sy * intrinsics.fy, sy * (intrinsics.cy - top + 0.5) - 0.5
-    return K
-
-
-def rotate_camera(image: Image, K: NDArray[np.float64], q_camera: NDArray[np.float64]) -> Image:
+def rotate_camera(
+    image: Image, camera: Camera, q_camera: NDArray[np.float64], zoom: float = 1.0
+) -> Image:
     """Return the image (height, width, 3) that the camera would see rotated by ``q_camera`` (4,).
 
-    ``R_new = R @ A``, where A is the quaternion's rotation in the camera frame. Pixels outside the
-    original image are filled by reflection at its border.
+    ``R_new = R @ A``, where A is the quaternion's rotation in the camera frame; the new camera has
+    ``zoom`` times the focal length. Pixels outside the original image are filled by reflection at
+    its border.
     """
     A = geometry.quaternion_to_matrix(q_camera)
-    # A ray d in the new camera is A d in the old one, so this maps new pixels to old pixels.
-    new_to_old = K @ A @ np.linalg.inv(K)
+    new = camera.zoomed(zoom)
+    if camera.distortion != "none":
+        # A ray d in the new camera is A d in the old one.
+        x, y = camera.project(_rays(new) @ A.T).astype(np.float32).T
+        shape = image.shape[:2]
+        turned = cv2.remap(
+            image,
+            x.reshape(shape),
+            y.reshape(shape),
+            cv2.INTER_LINEAR,
+            None,
+            cv2.BORDER_REFLECT_101,
+        )
+        return np.asarray(turned, dtype=np.uint8)
+    new_to_old = camera.matrix @ A @ np.linalg.inv(new.matrix)
     size = (image.shape[1], image.shape[0])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     turned = cv2.warpPerspective(
         image, new_to_old, size, flags=flags, borderMode=cv2.BORDER_REFLECT_101
     )
     return np.asarray(turned, dtype=np.uint8)
+
+
+@lru_cache(maxsize=64)
+def _rays(camera: Camera) -> NDArray[np.float64]:
+    """Return the rays (height * width, 3) through all pixels of a camera."""
+    y, x = np.mgrid[: camera.height, : camera.width]
+    rays = camera.rays(np.column_stack([x.ravel(), y.ravel()]))
+    # Pixels beyond the lens model show what is seen straight ahead.
+    return np.column_stack([np.nan_to_num(rays), np.ones(len(rays))])
 
 
 def change_light(image: Image, strength: float, generator: np.random.Generator) -> Image:
@@ -95,25 +128,40 @@ def change_light(image: Image, strength: float, generator: np.random.Generator) 
     return np.asarray(cv2.add(changed, noise, dtype=cv2.CV_8U), dtype=np.uint8)
 
 
+def blur(image: Image, longest_px: float, generator: np.random.Generator) -> Image:
+    """Blur every third image, by chance, along a straight path of at most ``longest_px``."""
+    if generator.random() > 1.0 / 3.0:
+        return image
+    length, angle = generator.uniform(0.0, longest_px), generator.uniform(0.0, math.pi)
+    shift = length * np.array([math.cos(angle), math.sin(angle)])
+    kernel = streak(shift, 2 * math.ceil(length) + 1)
+    blurred = cv2.filter2D(image, cv2.CV_8U, kernel, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred, dtype=np.uint8)
+
+
 def augmented(
     image: Image,
     pose: NDArray[np.float64],
-    K: NDArray[np.float64] | None,
+    camera: Camera | None,
     config: AugmentConfig,
     generator: np.random.Generator,
+    zoom: float = 1.0,
 ) -> tuple[Image, NDArray[np.float64]]:
     """Return one changed copy of a model input (height, width, 3) and its exact pose (7,).
 
-    Without a camera matrix, only the light changes.
+    Without a camera, only light and blur change. ``zoom`` is the copy's focal length as a multiple
+    of the camera's.
     """
     turned_pose = pose.copy()
-    if K is not None and config.rotation_deg > 0:
+    if camera is not None and config.rotation_deg > 0:
         rotvec = np.deg2rad(config.rotation_deg) * generator.standard_normal(3)
         q_camera = geometry.quaternion_exp(rotvec)
-        image = rotate_camera(image, K, q_camera)
+        image = rotate_camera(image, camera, q_camera, zoom)
         turned_pose[3:] = geometry.quaternion_normalise(
             geometry.quaternion_multiply(pose[3:], q_camera)
         )
+    if config.motion_blur > 0:
+        image = blur(image, 0.01 * config.motion_blur * image.shape[1], generator)
     if config.light > 0:
         image = change_light(image, config.light, generator)
     return image, turned_pose

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from cvo_edge.errors import UsageError
-from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.euroc import open_euroc
 from cvo_export.datasets.kitti import open_kitti
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
@@ -13,7 +13,7 @@ from cvo_export.datasets.seven_scenes import open_seven_scenes
 from cvo_export.datasets.synthetic import open_room
 from cvo_export.datasets.tum import open_tum
 
-__all__ = ["FORMATS", "Intrinsics", "PoseDataset", "open_dataset"]
+__all__ = ["FORMATS", "Intrinsics", "Lens", "PoseDataset", "open_dataset"]
 
 FORMATS: dict[str, Callable[[str], PoseDataset]] = {
     "7scenes": open_seven_scenes,

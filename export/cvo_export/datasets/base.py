@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.camera import Camera, Distortion
+
 
 class Intrinsics(NamedTuple):
     """A pinhole camera: focal lengths and principal point, all in pixels of the full image."""
@@ -26,6 +28,16 @@ class Intrinsics(NamedTuple):
     def scaled(self, factor: float) -> Intrinsics:
         """Return the same camera for images ``factor`` times as large."""
         return Intrinsics(*(factor * value for value in self))
+
+
+class Lens(NamedTuple):
+    """Lens distortion: its model and coefficients, see ``cvo_edge.camera.Camera``."""
+
+    distortion: Distortion = "none"
+    coefficients: tuple[float, ...] = ()
+
+
+NO_DISTORTION = Lens()
 
 
 @dataclass(frozen=True)
@@ -51,6 +63,8 @@ class PoseDataset:
         ``SourceError`` if the image cannot be read.
     intrinsics
         The camera, or None if the data set does not state it.
+    lens
+        The camera's lens distortion, which the images still have.
     own_train, own_test
         Sequence indices of the data set's own train and test lists; empty if it has no lists.
     skipped
@@ -64,12 +78,29 @@ class PoseDataset:
     frame_names: tuple[str, ...]
     read_image: Callable[[int], NDArray[np.uint8]]
     intrinsics: Intrinsics | None = None
+    lens: Lens = NO_DISTORTION
     own_train: frozenset[int] = frozenset()
     own_test: frozenset[int] = frozenset()
     skipped: Mapping[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    def camera(self) -> Camera | None:
+        """Return the camera with its image size and lens, or None if it is not stated.
+
+        Raises SourceError if the first image cannot be read.
+        """
+        if self.intrinsics is None:
+            return None
+        height, width = self.read_image(0).shape[:2]
+        return Camera(
+            width=width,
+            height=height,
+            **self.intrinsics._asdict(),
+            distortion=self.lens.distortion,
+            coefficients=self.lens.coefficients,
+        )
 
 
 def skipped_text(skipped: Mapping[str, int]) -> str:

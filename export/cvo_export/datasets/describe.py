@@ -24,6 +24,9 @@ def describe(dataset: PoseDataset) -> list[str]:
     if dataset.intrinsics is not None:
         numbers = dataset.intrinsics._asdict()
         camera = ", ".join(f"{name} {value:.1f}" for name, value in numbers.items()) + " px"
+        if dataset.lens.distortion != "none":
+            values = " ".join(f"{value:g}" for value in dataset.lens.coefficients)
+            camera += f", distortion {dataset.lens.distortion.replace('_', '-')} {values}"
     position_m = dataset.poses[:, :3]
     extent = zip("xyz", position_m.min(axis=0), position_m.max(axis=0), strict=True)
     counts = np.bincount(dataset.sequence, minlength=len(dataset.sequence_names))

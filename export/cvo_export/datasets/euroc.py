@@ -7,7 +7,7 @@ in the world. ``T_BS`` in ``cam0/sensor.yaml`` is ``T_body_camera``, so
 
     T_world_camera = T_world_body @ T_BS
 
-Images are grey and returned as BGR. Lens distortion is not corrected.
+Images are grey and returned as BGR. Lens distortion is read, not corrected.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from cvo_edge.camera import Distortion
 from cvo_edge.errors import SourceError
 from cvo_edge.ground_truth import matrix_to_pose
-from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
 from cvo_export.datasets.poses import camera_pose, quaternion_pose
@@ -34,6 +35,11 @@ Array = NDArray[np.float64]
 _IMAGES = "mav0/cam0/data.csv"
 _CAMERA = "mav0/cam0/sensor.yaml"
 _POSES = "mav0/state_groundtruth_estimate0/data.csv"
+
+_MODELS: dict[str, Distortion] = {
+    "radial-tangential": "radial_tangential",
+    "equidistant": "equidistant",
+}
 
 # One period of the ground truth (200 Hz). Camera and IMU are triggered together and the ground
 # truth uses the IMU's stamps, so the nearest pose belongs to the image and needs no interpolation.
@@ -47,19 +53,22 @@ def open_euroc(path: str) -> PoseDataset:
     ``V1_03``, ``V2_01`` to ``V2_03``); the files do not say, so this is not checked. Each image
     gets the pose with the nearest stamp. Frames with no pose within 5 ms, an invalid pose or a
     missing image are left out and counted. Intrinsics are set if ``sensor.yaml`` describes a
-    pinhole camera with radial-tangential distortion.
+    pinhole camera with radial-tangential or equidistant distortion.
 
     Raises SourceError if a file is missing or malformed, recordings come from different cameras,
     or no frame has a pose.
     """
     root = Path(path)
     frames = FrameList(root)
-    cameras: dict[str, Intrinsics | None] = {}
+    cameras: dict[str, tuple[Intrinsics, Lens] | None] = {}
     for name, folder in recordings(root, _IMAGES).items():
         cameras[name], T_body_camera = _read_camera(folder / _CAMERA)
         _add_recording(frames, name, folder, T_body_camera)
     dataset = frames.dataset(root.resolve().name)
-    return replace(dataset, intrinsics=only_camera(root, cameras))
+    camera = only_camera(root, cameras)
+    if camera is None:
+        return dataset
+    return replace(dataset, intrinsics=camera[0], lens=camera[1])
 
 
 def _add_recording(frames: FrameList, name: str, folder: Path, T_body_camera: Array) -> None:
@@ -78,8 +87,8 @@ def _add_recording(frames: FrameList, name: str, folder: Path, T_body_camera: Ar
     add_associated(frames, name, images, stamps_ns, pose_of, _MAX_STAMP_DIFFERENCE_NS)
 
 
-def _read_camera(path: Path) -> tuple[Intrinsics | None, Array]:
-    """Return the intrinsics and ``T_body_camera``, shape (4, 4), metres."""
+def _read_camera(path: Path) -> tuple[tuple[Intrinsics, Lens] | None, Array]:
+    """Return the intrinsics with the lens, and ``T_body_camera``, shape (4, 4), metres."""
     text = read_text(path, "a camera's T_BS and intrinsics")
     # OpenCV's tools require a first line %YAML:1.0, which is not valid YAML.
     text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
@@ -96,8 +105,10 @@ def _read_camera(path: Path) -> tuple[Intrinsics | None, Array]:
         found = " ".join(str(T_BS).split())[:80]
         raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid transform, found {found}")
     intrinsics = _numbers(document.get("intrinsics"), 4)
-    model = document.get("camera_model"), document.get("distortion_model")
-    if intrinsics is None or model != ("pinhole", "radial-tangential"):
+    model = _MODELS.get(str(document.get("distortion_model")))
+    coefficients = _numbers(document.get("distortion_coefficients"), 4)
+    pinhole = document.get("camera_model") == "pinhole"
+    if intrinsics is None or model is None or coefficients is None or not pinhole:
         return None, matrix.reshape(4, 4)
     camera = Intrinsics(*intrinsics.tolist())
     if not camera.possible:
@@ -105,7 +116,7 @@ def _read_camera(path: Path) -> tuple[Intrinsics | None, Array]:
             f"{path}: expected finite intrinsics with positive focal lengths, found "
             f"{intrinsics.tolist()}"
         )
-    return camera, matrix.reshape(4, 4)
+    return (camera, Lens(model, tuple(coefficients.tolist()))), matrix.reshape(4, 4)
 
 
 def _numbers(values: object, count: int) -> Array | None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from cvo_edge.errors import SourceError
 from cvo_edge.input.image_files import natural_key
-from cvo_export.datasets.base import Intrinsics
+
+Camera = TypeVar("Camera")
 
 
 def recordings(root: Path, marker: str) -> dict[str, Path]:
@@ -41,7 +43,7 @@ def only_world(root: Path, folders: list[Path], kind: str) -> Path:
     return folders[0]
 
 
-def only_camera(root: Path, cameras: Mapping[str, Intrinsics | None]) -> Intrinsics | None:
+def only_camera(root: Path, cameras: Mapping[str, Camera | None]) -> Camera | None:
     """Return the camera of all sequences; raises SourceError if they have different cameras."""
     (first, camera), *others = cameras.items()
     for name, other in others:

@@ -2,8 +2,7 @@
 
 A line of ``groundtruth.txt`` is ``timestamp tx ty tz qx qy qz qw``: seconds, metres and a
 quaternion, scalar last. The pose is ``T_world_camera`` of the colour camera (OpenCV), in the frame
-of the motion capture system. Lines that begin with ``#`` are comments. Depth images are not read,
-and the lens distortion of freiburg1 and freiburg2 is not corrected.
+of the motion capture system. Lines that begin with ``#`` are comments. Depth images are not read.
 """
 
 from __future__ import annotations
@@ -12,20 +11,29 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+from cvo_edge.camera import Distortion
 from cvo_edge.ground_truth import MAX_STAMP_DIFFERENCE_NS
-from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
 from cvo_export.datasets.poses import quaternion_pose
 from cvo_export.datasets.stamps import add_associated
 from cvo_export.datasets.tables import read_rows
 
-# Intrinsics of the colour cameras at 640x480, as calibrated by the data set's authors ("File
-# formats", table of intrinsics of the RGB cameras). The images of freiburg3 are undistorted.
+# Intrinsics and distortion of the colour cameras at 640x480, as calibrated by the data set's
+# authors ("File formats", table of intrinsics of the RGB cameras). The images of freiburg3 are
+# undistorted.
+_RADIAL: Distortion = "radial_tangential"
 _CAMERAS = {
-    "1": Intrinsics(517.3, 516.5, 318.6, 255.3),
-    "2": Intrinsics(520.9, 521.0, 325.1, 249.7),
-    "3": Intrinsics(535.4, 539.2, 320.1, 247.6),
+    "1": (
+        Intrinsics(517.3, 516.5, 318.6, 255.3),
+        Lens(_RADIAL, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    ),
+    "2": (
+        Intrinsics(520.9, 521.0, 325.1, 249.7),
+        Lens(_RADIAL, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    ),
+    "3": (Intrinsics(535.4, 539.2, 320.1, 247.6), Lens()),
 }
 _NOMINAL_WIDTH = 640
 
@@ -49,9 +57,11 @@ def open_tum(path: str) -> PoseDataset:
         _add_sequence(frames, name, folder)
     dataset = frames.dataset(root.resolve().name)
     camera = only_camera(root, {name: _camera(name) for name in folders})
-    if camera is not None:
-        camera = camera.scaled(dataset.read_image(0).shape[1] / _NOMINAL_WIDTH)
-    return replace(dataset, intrinsics=camera)
+    if camera is None:
+        return dataset
+    intrinsics, lens = camera
+    scale = dataset.read_image(0).shape[1] / _NOMINAL_WIDTH
+    return replace(dataset, intrinsics=intrinsics.scaled(scale), lens=lens)
 
 
 def _add_sequence(frames: FrameList, name: str, folder: Path) -> None:
@@ -69,6 +79,6 @@ def _add_sequence(frames: FrameList, name: str, folder: Path) -> None:
     )
 
 
-def _camera(name: str) -> Intrinsics | None:
+def _camera(name: str) -> tuple[Intrinsics, Lens] | None:
     found = re.search(r"(?<![a-z0-9])fr(?:eiburg)?([123])(?![a-z0-9])", name)
     return _CAMERAS[found[1]] if found else None

@@ -95,8 +95,8 @@ class Backbone(nn.Module):
                     f"grid: expected at most {map_height}x{map_width} for stage "
                     f"{config.stages[number]} of {config.name}, found {rows}x{columns}"
                 )
-            self.register_buffer(f"_rows{number}", _averaging(map_height, rows))
-            self.register_buffer(f"_columns{number}", _averaging(map_width, columns).T)
+            self.register_buffer(f"_rows{number}", averaging(map_height, rows))
+            self.register_buffer(f"_columns{number}", averaging(map_width, columns).T)
         self.size = sum(shape[0] for shape in self.map_shapes) * config.grid[0] * config.grid[1]
 
     def _cut(self) -> list[int]:
@@ -193,7 +193,7 @@ def _mean_std(body: nn.Module, normalisation: Normalisation) -> tuple[list[float
     return list(config["mean"]), list(config["std"])
 
 
-def _averaging(size: int, cells: int) -> Tensor:
+def averaging(size: int, cells: int) -> Tensor:
     """Matrix (cells, size) of the means over ``cells`` equal spans; spans may share a pixel.
 
     A product with a constant matrix exports to any runtime for all sizes; adaptive pooling does so

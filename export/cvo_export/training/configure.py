@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -11,7 +12,6 @@ from msgspec import Struct
 
 from cvo_edge.errors import UsageError
 from cvo_edge.vocabulary import Crop, SplitKind
-from cvo_export.data.augment import AugmentConfig
 from cvo_export.data.splits import default_kind
 from cvo_export.datasets import open_dataset
 from cvo_export.networks.backbone import NO_WEIGHTS, TIMM_WEIGHTS, BackboneConfig
@@ -49,7 +49,9 @@ def configure(
     if normalisation is None:
         normalisation = "timm" if weights in (TIMM_WEIGHTS, NO_WEIGHTS) else "half"
     numbers: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    defaults = TRAINABLE[method]
     augment = {key: numbers.pop(key) for key in ("rotation_deg", "light") if key in numbers}
+    numbers = {"copies": defaults.copies, "steps": defaults.steps, **numbers}
     kind = split or default_kind(open_dataset(dataset))
     return TrainConfig(
         dataset=dataset,
@@ -62,7 +64,7 @@ def configure(
             backbone, tuple(stages.split(",")), _pair(grid, "grid", "ROWSxCOLUMNS"), normalisation
         ),
         weights=weights,
-        augment=AugmentConfig(**augment),
+        augment=replace(defaults.augment, **augment),
         head=chosen,
         **numbers,
     )

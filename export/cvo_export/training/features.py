@@ -16,6 +16,7 @@ from zipfile import BadZipFile
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from cvo_edge.engine.cores import allowed_cores
 from cvo_edge.engine.session import Session
@@ -23,10 +24,9 @@ from cvo_edge.errors import SourceError
 from cvo_edge.files import whole_file
 from cvo_edge.input import preprocess
 from cvo_edge.vocabulary import Crop
-from cvo_export.data.augment import AugmentConfig, augmented, model_intrinsics
+from cvo_export.data.augment import AugmentConfig, augmented
 from cvo_export.datasets import PoseDataset
 from cvo_export.graph.to_onnx import export_onnx
-from cvo_export.networks.backbone import Backbone
 from cvo_export.progress import Progress
 
 Array = NDArray[np.float64]
@@ -46,14 +46,16 @@ class ModelImages:
     ) -> None:
         self.poses = dataset.poses[indices]
         self.images = np.empty((indices.size, height, width, 3), dtype=np.uint8)
-        self.K: Array | None = None
+        camera = dataset.camera()
+        # The camera whose images these are, or None.
+        self.camera = None
+        if camera is not None:
+            self.camera = preprocess.input_camera(camera, height, width, crop)
         for row, index in enumerate(indices.tolist()):
             image = preprocess.to_bgr8(dataset.read_image(index))
             if image is None:
                 raise SourceError(f"{dataset.frame_names[index]}: expected a colour image")
             self.images[row] = preprocess.model_input(image, height, width, crop)[0]
-            if self.K is None and dataset.intrinsics is not None:
-                self.K = model_intrinsics(dataset.intrinsics, image.shape, height, width, crop)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -63,19 +65,20 @@ class ModelImages:
         return hashlib.sha256(self.images.tobytes()).hexdigest()
 
     def augmented(
-        self, row: int, config: AugmentConfig, generator: np.random.Generator
+        self, row: int, config: AugmentConfig, generator: np.random.Generator, zoom: float = 1.0
     ) -> tuple[Image, Array]:
         """Return an augmented copy of one image and its exact pose (7,)."""
-        return augmented(self.images[row], self.poses[row], self.K, config, generator)
+        image, pose = self.images[row], self.poses[row]
+        return augmented(image, pose, self.camera, config, generator, zoom)
 
 
 class FeatureExtractor:
-    """Images (height, width, 3) uint8 RGB -> features (size,), by the exported backbone.
+    """Images (height, width, 3) uint8 RGB -> features, by the exported backbone.
 
     The first image triggers the export: a run whose features are all cached does without it.
     """
 
-    def __init__(self, backbone: Backbone, height: int, width: int) -> None:
+    def __init__(self, backbone: nn.Module, height: int, width: int) -> None:
         self._backbone = backbone
         self._blank = torch.zeros((1, height, width, 3), dtype=torch.uint8)
         self._session: Session | None = None
@@ -94,7 +97,7 @@ class FeatureExtractor:
 def cached_features(
     folder: Path, images: ModelImages, extractor: FeatureExtractor
 ) -> NDArray[np.float32]:
-    """Features (n, size) of the unaugmented images, cached in a file named after their pixels."""
+    """Features (n, ...) of the unaugmented images, cached in a file named after their pixels."""
     path = folder / f"frames-{images.digest()[:24]}.npz"
     found = _stored(path, len(images))
     if found is None:
@@ -112,18 +115,19 @@ def cached_copies(
     seed: int,
     progress: Progress,
 ) -> tuple[NDArray[np.float16], Array]:
-    """Features (copies + 1, n, size) and poses (copies + 1, n, 7); copy 0 is not augmented.
+    """Features (copies + 1, n, ...) and poses (copies + 1, n, 7); copy 0 is not augmented.
 
     Each copy is a separate file, written atomically, so that an interrupted run resumes with
     the next copy.
     """
+    zooms = config.zooms(copies)
     features, poses = [], []
     for number in range(copies + 1):
         path = folder / f"copy-{number:03d}.npz"
         found = _stored(path, len(images))
         if found is None:
             graded = config.graded(number / max(1, copies))
-            found = _one_copy(images, extractor, graded, (seed, number))
+            found = _one_copy(images, extractor, graded, (seed, number), zooms[number])
             _store(path, found)
         features.append(found["features"])
         poses.append(found["poses"])
@@ -148,11 +152,15 @@ def _store(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def _one_copy(
-    images: ModelImages, extractor: FeatureExtractor, config: AugmentConfig, seed: tuple[int, int]
+    images: ModelImages,
+    extractor: FeatureExtractor,
+    config: AugmentConfig,
+    seed: tuple[int, int],
+    zoom: float,
 ) -> dict[str, NDArray[Any]]:
     def one(row: int) -> tuple[NDArray[np.float16], Array]:
         # A generator per image makes the result independent of the processing order.
-        image, pose = images.augmented(row, config, np.random.default_rng((*seed, row)))
+        image, pose = images.augmented(row, config, np.random.default_rng((*seed, row)), zoom)
         return extractor(image).astype(np.float16), pose
 
     # OpenCV and onnxruntime release the GIL, so threads can process whole images.

@@ -17,7 +17,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cvo_edge.errors import UsageError
 from cvo_edge.files import whole_file
-from cvo_export.networks.heads.base import Examples, Learner
+from cvo_export.networks.heads.base import Examples, Learner, Schedule
 from cvo_export.progress import Stage
 from cvo_export.training.material import Material
 from cvo_export.training.run import History
@@ -45,6 +45,7 @@ class Lesson:
         rows: Indices,
         examples: Examples | None,
         candidate: bool,
+        schedule: Schedule,
     ) -> None:
         self.material = material
         self.config = material.config
@@ -53,6 +54,7 @@ class Lesson:
         self.rows = rows
         self._examples = examples
         self._candidate = candidate
+        self._schedule = schedule
         self.both = nn.ModuleDict({"backbone": material.backbone, "learner": learner})
         self.history: list[History] = []
         self._seed = lesson_seed(self.config.seed, name)
@@ -78,19 +80,21 @@ class Lesson:
             return
         examples = self._examples or self.material.examples(phase)
         if phase == 0:
-            self.learner.standardise.fit(examples.x[:, self.rows])
+            self.learner.fit_inputs(examples.x[:, self.rows])
         x = torch.from_numpy(examples.x)
         y = torch.tensor(examples.y, dtype=torch.float32)
 
         def batch(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
-            copy = generator.integers(x.shape[0], size=self.config.batch_size)
-            frame = self.rows[generator.integers(self.rows.size, size=self.config.batch_size)]
+            count = self._schedule.batch_size
+            copy = generator.integers(x.shape[0], size=count)
+            frame = self.rows[generator.integers(self.rows.size, size=count)]
             return x[copy, frame].float(), y[copy, frame]
 
-        groups = [{"params": list(self.learner.parameters()), "peak": self.config.learning_rate}]
-        with _one_thread():
+        groups = self.learner.groups(self._schedule.learning_rate)
+        steps = self._schedule.steps or self.config.steps
+        with _threads(self._schedule.threads):
             val = examples.val_x, examples.val_y
-            self._loop(phase, "training", groups, self.config.steps, batch, lambda _: val, state)
+            self._loop(phase, "training", groups, steps, batch, lambda _: val, state)
 
     def _fit_all(self, phase: int, state: dict[str, Any] | None) -> None:
         """Train backbone and head together on fresh augmented images."""
@@ -238,10 +242,10 @@ def _cloned(module: nn.Module) -> dict[str, Tensor]:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Limit torch to one thread: a batch of 64 rows is too small to split."""
+def _threads(count: int | None) -> Iterator[None]:
+    """Limit torch to this many threads, if given."""
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count or before)
     try:
         yield
     finally:

@@ -16,14 +16,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvo_edge.camera import Camera
 from cvo_edge.errors import UsageError
+from cvo_export.data.place import Place
+from cvo_export.data.sparse_map import SparseMap, read_sparse_map, sparse_map, write_sparse_map
 from cvo_export.data.splits import Split, deal_folds, make_split, training_frames
 from cvo_export.datasets import PoseDataset, open_dataset
-from cvo_export.networks.backbone import Backbone, load_weights
 from cvo_export.networks.heads import Setting
-from cvo_export.networks.heads.base import Examples, L
+from cvo_export.networks.heads.base import Examples, L, Schedule
 from cvo_export.networks.methods import TRAINABLE
 from cvo_export.networks.standardised import fit_target
+from cvo_export.networks.stem import Upper
 from cvo_export.progress import Progress
 from cvo_export.training.features import (
     FeatureExtractor,
@@ -33,12 +36,22 @@ from cvo_export.training.features import (
 )
 from cvo_export.training.lesson import Lesson, lesson_seed
 from cvo_export.training.material import FEATURES_FOLDER, Material, shared_folder
-from cvo_export.training.run import History, PoseGraph, Run, TrainConfig, claim_run, open_run
+from cvo_export.training.run import (
+    History,
+    PoseGraph,
+    Run,
+    TrainConfig,
+    claim_run,
+    loaded_backbone,
+    open_run,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Batch = Callable[[np.random.Generator], tuple[Tensor, Tensor]]
 
+
+MAP_FILE = "map.npz"
 
 # With fewer scores, the threshold at 0.9 is not finite.
 _LEAST_VAL = 9
@@ -56,8 +69,7 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     dataset, split = open_run(run_dir, config)
     _check_val(config, split)
     torch.manual_seed(config.seed)
-    backbone = Backbone(config.backbone, config.height, config.width)
-    weights_sha256 = load_weights(backbone, config.weights)
+    backbone, upper, weights_sha256 = loaded_backbone(config, config.weights)
     parts = training_frames(dataset, split, config.share)
     indices = np.concatenate(parts)
     target = fit_target(dataset.poses[indices])
@@ -79,6 +91,9 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
             ModelImages(dataset, split.roles["val"], *size),
             progress,
         ),
+        dataset,
+        upper,
+        indices,
         n_train=parts[0].size,
         folds=partial(deal_folds, dataset, split, indices),
     )
@@ -110,8 +125,7 @@ def prepare_features(config: TrainConfig, cache: Path, progress: Progress) -> No
     dataset = open_dataset(config.dataset)
     split = make_split(dataset, config.split, config.seed)
     indices = np.concatenate(training_frames(dataset, split, config.share))
-    backbone = Backbone(config.backbone, config.height, config.width)
-    weights_sha256 = load_weights(backbone, config.weights)
+    backbone, _, weights_sha256 = loaded_backbone(config, config.weights)
     if weights_sha256 is None:
         return
     size = (config.height, config.width, config.crop)
@@ -138,9 +152,16 @@ class _Trainer:
     """
 
     def __init__(
-        self, material: Material, n_train: int, folds: Callable[[int], list[Indices]]
+        self,
+        material: Material,
+        dataset: PoseDataset,
+        upper: Upper | None,
+        indices: Indices,
+        n_train: int,
+        folds: Callable[[int], list[Indices]],
     ) -> None:
-        self.setting = Setting(material.backbone.size, material.target, material.config.seed)
+        self.setting = Setting(material.backbone.size, material.target, material.config.seed, upper)
+        self._dataset, self._indices = dataset, indices
         self.n_images = len(material.images)
         self.n_train = n_train
         self.fine_tuned = material.config.fine_tune > 0
@@ -155,6 +176,7 @@ class _Trainer:
         rows: Indices | None = None,
         examples: Examples | None = None,
         candidate: bool = True,
+        schedule: Schedule | None = None,
     ) -> L:
         """Train the network made by ``build``; random numbers depend on ``name``."""
         if self.fine_tuned and self.history and examples is None:
@@ -165,13 +187,45 @@ class _Trainer:
         learner = build()
         if rows is None:
             rows = np.arange(self.n_images if examples is None else examples.x.shape[1])
-        lesson = Lesson(self._material, name, learner, rows, examples, candidate)
+        if schedule is None:
+            config = self._material.config
+            schedule = Schedule(None, config.batch_size, config.learning_rate)
+        lesson = Lesson(self._material, name, learner, rows, examples, candidate, schedule)
         self.history += lesson.fit()
         return learner
 
     def poses(self) -> Array:
         """Poses of the training images."""
         return self._material.images.poses
+
+    def place(self) -> Place:
+        """Return the place that the training images show; its map is cached in the run's folder."""
+        config, camera = self._material.config, self._dataset.camera()
+        if camera is None or self._material.images.camera is None or self.setting.upper is None:
+            raise UsageError(
+                f"{config.dataset}: expected the camera's intrinsics for {config.method}, found "
+                "none in the data set"
+            )
+        return Place(
+            self._sparse_map(camera),
+            self._material.images.camera,
+            self.setting.upper.grid,
+            config.augment.zooms(config.copies),
+        )
+
+    def _sparse_map(self, camera: Camera) -> SparseMap:
+        path = self._material.run_dir / MAP_FILE
+        found = read_sparse_map(path)
+        if found is None:
+            found = sparse_map(
+                lambda row: self._dataset.read_image(int(self._indices[row])),
+                self._material.images.poses,
+                camera,
+                self.setting.seed,
+                lambda done, total: self._material.progress("map", done, total),
+            )
+            write_sparse_map(found, path)
+        return found
 
     def features(self) -> tuple[NDArray[np.float16], Array]:
         """Features and poses of all copies of the training images, from the trained backbone."""

@@ -16,6 +16,7 @@ from torch import Tensor
 from cvo_export.networks.backbone import Backbone
 from cvo_export.networks.heads.base import Examples
 from cvo_export.networks.standardised import Target
+from cvo_export.networks.stem import Stem
 from cvo_export.progress import Progress
 from cvo_export.training.features import (
     FeatureExtractor,
@@ -32,12 +33,15 @@ FEATURES_FOLDER = "features"
 
 @dataclass
 class Material:
-    """Data shared by all lessons of a run, and the folders that cache it."""
+    """Data shared by all lessons of a run, and the folders that cache it.
+
+    ``backbone`` is a ``Backbone``, or the ``Stem`` of a method with cells.
+    """
 
     run_dir: Path
     features_folder: Path
     config: TrainConfig
-    backbone: Backbone
+    backbone: Backbone | Stem
     target: Target
     images: ModelImages
     val_images: ModelImages
@@ -50,7 +54,7 @@ class Material:
     def cached(self, phase: int) -> tuple[NDArray[np.float16], Array, Tensor]:
         """Features and poses of all copies, features of val, from the backbone of a phase.
 
-        Shapes (copies + 1, n, size), (copies + 1, n, 7) and (n_val, size).
+        Shapes (copies + 1, n, ...), (copies + 1, n, 7) and (n_val, ...).
         """
         if phase not in self._cached:
             config, folder = self.config, self.features_folder
@@ -89,7 +93,7 @@ def shared_folder(
         "backbone": msgspec.to_builtins(config.backbone),
         "image": [config.height, config.width, config.crop],
         "augment": [msgspec.to_builtins(config.augment), config.copies, config.seed],
-        "intrinsics": None if images.K is None else images.K.tolist(),
+        "camera": msgspec.to_builtins(images.camera),
         "pixels": images.digest(),
         "poses": images.poses.tolist(),
     }

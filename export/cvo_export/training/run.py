@@ -17,10 +17,11 @@ from cvo_edge.vocabulary import Crop, SplitKind
 from cvo_export.data.augment import AugmentConfig
 from cvo_export.data.splits import Split, make_split, read_split_spec, same_split
 from cvo_export.datasets import PoseDataset, open_dataset
-from cvo_export.networks.backbone import Backbone, BackboneConfig
+from cvo_export.networks.backbone import NO_WEIGHTS, Backbone, BackboneConfig, load_weights
 from cvo_export.networks.heads import ExportedHead, Setting
 from cvo_export.networks.methods import TRAINABLE, options_of
 from cvo_export.networks.standardised import Target
+from cvo_export.networks.stem import Stem, Upper, split_backbone
 
 CONFIG_FILE = "config.json"
 SPLIT_FILE = "split.json"
@@ -111,7 +112,7 @@ class History(NamedTuple):
 class PoseGraph(nn.Module):
     """The exported graph: images (n, height, width, 3), uint8 RGB -> the method's outputs."""
 
-    def __init__(self, backbone: Backbone, head: ExportedHead) -> None:
+    def __init__(self, backbone: Backbone | Stem, head: ExportedHead) -> None:
         super().__init__()
         self.backbone = backbone
         self.head = head
@@ -168,6 +169,21 @@ class Run:
         ]
 
 
+def loaded_backbone(
+    config: TrainConfig, weights: str
+) -> tuple[Backbone | Stem, Upper | None, str | None]:
+    """Return the run's backbone and the sha256 of its weights.
+
+    A method with cells gets a stem and, as the second value, the stages after it. Raises
+    UsageError.
+    """
+    size = config.height, config.width
+    if TRAINABLE[config.method].cells:
+        return split_backbone(config.backbone, *size, weights)
+    backbone = Backbone(config.backbone, *size)
+    return backbone, None, load_weights(backbone, weights)
+
+
 def open_run(run_dir: Path, config: TrainConfig) -> tuple[PoseDataset, Split]:
     """Open the data set of a configuration and split it; writes nothing.
 
@@ -222,8 +238,8 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
     opened = open_dataset(dataset or config.dataset)
     split = same_split(opened, recorded)
     target = Target(*(values.numpy() for values in stored["target"]))
-    backbone = Backbone(config.backbone, config.height, config.width)
-    setting = Setting(backbone.size, target, config.seed)
+    backbone, upper, _ = loaded_backbone(config, NO_WEIGHTS)
+    setting = Setting(backbone.size, target, config.seed, upper)
     try:
         backbone.load_state_dict(stored["backbone"])
         head = TRAINABLE[config.method].restore(setting, config.head, stored["head"])

@@ -6,7 +6,7 @@ runtime, and one line in each registry.
 
 from __future__ import annotations
 
-from cvo_export.networks.heads import cjp, cqr, csp, mcqr
+from cvo_export.networks.heads import cjp, cqr, csp, fused, mcqr, scr
 from cvo_export.networks.heads.base import ExportedHead, Lessons, Method, Setting
 
 __all__ = ["METHODS", "ExportedHead", "Lessons", "Method", "Setting"]
@@ -16,4 +16,6 @@ METHODS: dict[str, Method] = {
     "cqr": cqr.METHOD,
     "csp": csp.METHOD,
     "mcqr": mcqr.METHOD,
+    "scr": scr.METHOD,
+    "fused": fused.METHOD,
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -18,7 +18,10 @@ from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_edge.heads import Candidate
 from cvo_edge.pose import Rotation
 from cvo_export.bundles.draft import HALF_WIDTH_FLOOR, six
+from cvo_export.data.augment import AugmentConfig
+from cvo_export.data.place import Place
 from cvo_export.networks.standardised import Target
+from cvo_export.networks.stem import Upper
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -62,10 +65,18 @@ def dense(inputs: int, outputs: int, dropout: float = 0.0) -> list[nn.Module]:
 class Learner(nn.Module):
     """A network and its loss, trained by one lesson of the training loop.
 
-    The training loop fills ``standardise`` before the first step.
+    The training loop calls ``fit_inputs`` before the first step.
     """
 
     standardise: Standardise
+
+    def fit_inputs(self, inputs: NDArray[Any]) -> None:
+        """Fit the standardisation to inputs (copies, n, size) before the first step."""
+        self.standardise.fit(inputs)
+
+    def groups(self, rate: float) -> list[dict[str, Any]]:
+        """Return the optimiser's groups of parameters, each with its peak learning rate."""
+        return [{"params": list(self.parameters()), "peak": rate}]
 
     @abstractmethod
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
@@ -129,22 +140,45 @@ class ExportedHead(nn.Module):
 
 
 class Setting(NamedTuple):
-    """Inputs to every head's constructor: number of features, target, and the run's seed."""
+    """Inputs to every head's constructor.
+
+    Number of features, target, the run's seed and, for a method with cells, the stages after the
+    stem, with pretrained weights in a new run.
+    """
 
     feature_size: int
     target: Target
     seed: int
+    upper: Upper | None = None
+
+    def cells(self) -> Upper:
+        """Return the stages after the stem of a method with cells."""
+        if self.upper is None:
+            raise TypeError("expected a method with cells")
+        return self.upper
+
+
+class Schedule(NamedTuple):
+    """Steps of a lesson (None: the run's), examples per step, learning rate and torch's threads.
+
+    Most lessons use one thread, because a batch of 64 rows is too small to split; None uses all.
+    """
+
+    steps: int | None
+    batch_size: int
+    learning_rate: float
+    threads: int | None = 1
 
 
 class Examples(NamedTuple):
     """Training data of a lesson that does not learn from features.
 
-    Inputs (copies, n, size) and truths (copies, n, 6) of the training images, for any number of
-    copies; inputs (n_val, size) and truths (n_val, 6) of val.
+    Inputs (copies, n, ...) and truths (copies, n, ...) of the training images, for any number of
+    copies, in the shapes that the learner's loss takes; inputs and truths (n_val, ...) of val.
     """
 
     x: NDArray[np.float16] | NDArray[np.float32]
-    y: Array
+    y: NDArray[Any]
     val_x: Tensor
     val_y: Array
 
@@ -166,12 +200,13 @@ class Lessons(Protocol):
         rows: Indices | None = None,
         examples: Examples | None = None,
         candidate: bool = True,
+        schedule: Schedule | None = None,
     ) -> L:
         """Train the network made by ``build`` on these rows (default: all).
 
         The result is stored and resumed by name. Uses features and standardised poses unless
         ``examples`` are given. Pass ``candidate=False`` for a network that is discarded or only
-        models residuals: its val score is not the run's.
+        models residuals: its val score is not the run's. ``schedule`` None uses the run's options.
         """
 
     def folds(self, count: int) -> list[Indices]:
@@ -183,8 +218,17 @@ class Lessons(Protocol):
     def val(self) -> tuple[Tensor, Array]:
         """Return features (n_val, size) and poses (n_val, 7) of val."""
 
+    def place(self) -> Place:
+        """Return the place that the training images show; for methods with cells.
+
+        Raises UsageError if the data set does not state its camera.
+        """
+
     def features(self) -> tuple[NDArray[np.float16], Array]:
-        """Features (copies + 1, n, size), poses (copies + 1, n, 7); copy 0 is not augmented."""
+        """Features (copies + 1, n, size), poses (copies + 1, n, 7); copy 0 is not augmented.
+
+        For a method with cells, features are the stem's maps.
+        """
 
 
 @dataclass(frozen=True)
@@ -192,11 +236,17 @@ class Method:
     """One method: its options, its training, and how to restore a trained head.
 
     ``restore`` rebuilds a head from its state dict, given the setting and options of its training.
+    ``cells``: whether the head reads the map of a stem and trains the stages after it. ``copies``,
+    ``steps`` and ``augment`` are the defaults of a run.
     """
 
     config: type[Struct]
     train: Callable[[Lessons, Any], ExportedHead]
     restore: Callable[[Setting, Any, Mapping[str, Tensor]], ExportedHead]
+    cells: bool = False
+    copies: int = 48
+    steps: int = 10_000
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
 
 
 def interval_candidates(parameters: Struct) -> tuple[Candidate, ...]:

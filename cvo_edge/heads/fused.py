@@ -1,0 +1,169 @@
+"""Scene coordinates and a regressed pose, fused: precise in new places and on known frames.
+
+The errors of scene coordinate regression (``cvo_edge.heads.scr``) and of a network that regresses
+the pose hardly correlate, so that both together know more than each. With the solver's information
+H and the regression's half-widths h, both scaled on val, the fused pose minimises
+
+    e^T kappa H e  +  share (e - d)^T diag(1 / (rho h)^2) (e - d)
+
+where d is the regression's offset (t_r - t_s, Log(R_s^T R_r)) from the solved pose. Where the two
+disagree by more than their deviations, the covariance grows by the Birge ratio (Birge 1932). The
+network that regresses has learned one camera: with another focal length, it is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from msgspec import Meta, Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from cvo_edge import geometry
+from cvo_edge.bundle.format import Positive, SixPositive
+from cvo_edge.conformal import conformal_quantile, interval_score
+from cvo_edge.heads.base import Candidate
+from cvo_edge.heads.scr import ScrHead, ScrParameters
+from cvo_edge.pose import Chart
+from cvo_edge.pose_solver import Solution
+
+Array = NDArray[np.float64]
+
+_CHART = Chart("tangent_predicted")
+# Shares of the regression's information that val chooses from.
+_SHARES = (0.0, 0.1, 0.3, 1.0)
+# Relative difference of focal lengths up to which two cameras are the same.
+_SAME_FOCAL = 0.01
+_MEDIAN_CHI2_6 = 5.348
+
+
+class Fusion(Struct, frozen=True, forbid_unknown_fields=True):
+    """Weights of the two poses, from val.
+
+    ``kappa`` scales the solver's information; ``rho`` (per DoF) makes the regression's half-widths
+    standard deviations; ``share`` of the regression's information is used.
+    """
+
+    kappa: Positive
+    rho: SixPositive
+    share: Annotated[float, Meta(ge=0, le=1)]
+
+
+class FusedParameters(ScrParameters, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``method_parameters`` of a fused bundle: those of SCR and the weights.
+
+    ``focal_px``: focal length, in pixels of the model's input, of the camera that the regression
+    has learned. ``fusion`` null uses the solver alone.
+    """
+
+    focal_px: Positive
+    fusion: Fusion | None
+
+
+class FusedHead(ScrHead):
+    """Score and sets of scene coordinates fused with a regressed pose."""
+
+    method = "fused"
+    parameters_type: ClassVar[type[Struct]] = FusedParameters
+    parameters: FusedParameters
+
+    def __init__(self, parameters: FusedParameters, score: str) -> None:
+        super().__init__(parameters, score)
+        self.outputs = {**self.outputs, "regression": (1, 7), "half_width": (1, 6)}
+
+    def combined(
+        self, outputs: Mapping[str, NDArray[Any]], found: Solution, focal_px: float
+    ) -> tuple[Array, Array, dict[str, Array]]:
+        """As ``ScrHead``: the fused pose; adds ``solved_pose`` (1, 7) and ``solved`` (1, 6, 6)."""
+        added = {"solved_pose": found.pose[np.newaxis], "solved": found.information[np.newaxis]}
+        fusion, own = self.parameters.fusion, self.parameters.focal_px
+        if fusion is None or fusion.share == 0.0 or abs(focal_px / own - 1.0) > _SAME_FOCAL:
+            return found.pose, found.information, added
+        regression = np.asarray(outputs["regression"][0], np.float64)
+        regression[3:] = geometry.quaternion_normalise(regression[3:])
+        pose, information = fused(
+            found.pose, found.information, regression, outputs["half_width"][0], fusion
+        )
+        return pose, information, added
+
+    def tuned(
+        self,
+        val: Mapping[str, NDArray[Any]],
+        poses: Array,
+        known: Mapping[str, NDArray[Any]],
+    ) -> FusedParameters:
+        """As ``ScrHead``, and the weights with the best interval score on val."""
+        limits = super().tuned(val, poses, known).limits
+        regression = np.asarray(val["regression"], np.float64)
+        regression[:, 3:] = geometry.quaternion_normalise(regression[:, 3:])
+        solved, half_width = val["solved_pose"], np.asarray(val["half_width"], np.float64)
+        error = _offset(poses, solved)
+        distance = np.einsum("ni,nij,nj->n", error, val["solved"], error)
+        kappa = _MEDIAN_CHI2_6 / max(float(np.median(distance)), 1e-9)
+        ratio = np.abs(_offset(poses, regression)) / np.maximum(half_width, 1e-12)
+        rho = tuple(np.maximum(1.4826 * np.median(ratio, axis=0), 1e-6).tolist())
+        choices = [Fusion(kappa, rho, share) for share in _SHARES]
+        scores = [
+            _score(poses, solved, val["solved"], regression, half_width, fusion)
+            for fusion in choices
+        ]
+        return replace(self.parameters, limits=limits, fusion=choices[int(np.argmin(scores))])
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """As ``ScrHead``; other data need other weights."""
+        return (Candidate(self.score, replace(self.parameters, limits=None, fusion=None)),)
+
+
+def fused(
+    solved: Array,
+    information: Array,
+    regression: Array,
+    half_width: NDArray[Any],
+    fusion: Fusion,
+) -> tuple[Array, Array]:
+    """Solved pose (7,) and information (6, 6), regressed pose (7,) and half-widths (6,) -> fused.
+
+    Returns the pose (7,) and its information (6, 6), m and rad.
+    """
+    H = fusion.kappa * information
+    D = fusion.share / np.square(np.array(fusion.rho) * np.maximum(half_width, 1e-12))
+    offset = _offset(regression, solved)
+    total = H + np.diag(D)
+    step = np.linalg.solve(total, D * offset)
+    rest = offset - step
+    disagreement = (float(step @ H @ step) + float(rest @ (D * rest))) / 6.0
+    pose = np.concatenate(
+        [
+            solved[:3] + step[:3],
+            geometry.quaternion_multiply(solved[3:], geometry.quaternion_exp(step[3:])),
+        ]
+    )
+    return pose, total / max(1.0, disagreement)
+
+
+def _offset(poses: Array, origins: Array) -> Array:
+    """Return (t - t_o, Log(R_o^T R)) of poses (..., 7) from origins (..., 7), (..., 6)."""
+    return _CHART.coordinates(poses, origins) - _CHART.coordinates(origins, origins)
+
+
+def _score(
+    poses: Array,
+    solved: Array,
+    information: Array,
+    regression: Array,
+    half_width: Array,
+    fusion: Fusion,
+) -> float:
+    """Return the interval score at 0.9 over n val frames, in units of their median error."""
+    found = [
+        fused(*frame, fusion)
+        for frame in zip(solved, information, regression, half_width, strict=True)
+    ]
+    error = np.abs([_offset(pose, each[0]) for pose, each in zip(poses, found, strict=True)])
+    deviation = np.sqrt([np.diag(np.linalg.inv(each[1])) for each in found])
+    q_hat = [conformal_quantile(column, 0.9) for column in (error / deviation).T]
+    half = np.array(q_hat) * deviation
+    unit = np.median(np.abs(_offset(poses, solved)), axis=0)
+    return float((interval_score(2 * half, np.maximum(error - half, 0.0), 0.1) / unit).mean())

@@ -1,0 +1,233 @@
+"""Scene coordinate regression (SCR): the network predicts points, a solver finds the pose.
+
+The model gives for each cell of the image the world point X_i that the cell shows, and the scale
+s_i (pixels of the model's input) of that point's reprojection error (Shotton et al. 2013; Brachmann
+and Rother 2021). ``cvo_edge.pose_solver`` finds the pose and, from the curvature of the likelihood,
+a covariance C = L L^T of the six errors e = (t - t_hat, Log(R_hat^T R)). The nonconformity scores
+are
+
+    marginal  |e_d| / max(sqrt(C_dd), floor_d)      joint  |L'^-1 e|
+
+where L' is L with its rows enlarged by the same floors. The marginal set is an interval about the
+solved pose; the joint set is an ellipsoid. Frames that agree on a pose get narrow sets.
+
+A frame also tells how far it can be trusted: in a place the network does not know, the cells are
+vague, or disagree on the pose. ``Signs`` holds the limits, from frames of the known place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from msgspec import Meta, Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from cvo_edge.bundle.format import Number, Positive, PreprocessSpec, SixPositive, Threshold
+from cvo_edge.camera import Camera, cell_centres
+from cvo_edge.conformal import JointScale, LinearScale
+from cvo_edge.errors import CalibrationFileError
+from cvo_edge.estimate import Reason
+from cvo_edge.heads.base import Candidate, Head, Solved, Solver
+from cvo_edge.heads.cqr import infinite_where_null, refuse_negative
+from cvo_edge.input.preprocess import input_camera
+from cvo_edge.pose_solver import PoseSolver, Solution
+from cvo_edge.sets import ConformalSet, Ellipsoids, scaled_distance, unbounded_set
+from cvo_edge.vocabulary import Joint, Scope
+
+Array = NDArray[np.float64]
+Seven = tuple[Number, Number, Number, Number, Number, Number, Number]
+
+# Longer last steps of the solver, in deviations, mean that the cells contradict each other.
+_CONVERGED = 0.05
+# The signs look at this many cells of the smallest scale; a part of a known place suffices.
+BEST_CELLS = 100
+# A cell contradicts the pose if its reprojection error exceeds this many scales.
+_CONTRADICTS = 3.0
+_HAIR = 1e-12
+# Limits lie this far beyond the largest sign of the known frames, because a new recording of the
+# same place has frames that are a little harder.
+_MARGIN_ERROR, _MARGIN_CONTRADICTING = 1.3, 0.05
+_LEAST_ERROR_PX = 0.1
+
+
+class Signs(Struct, frozen=True, forbid_unknown_fields=True):
+    """What a frame says of itself: limits, or one frame's values.
+
+    Over the cells of the smallest scale: ``error_px``, the median reprojection error in pixels of
+    the model's input, which is large where the network does not know what it sees;
+    ``contradicting``, the share whose error exceeds three scales, which is large where it knows
+    the place, but the image is not what the camera would see.
+    """
+
+    error_px: Positive
+    contradicting: Annotated[float, Meta(ge=0, le=1)]
+
+
+class ScrParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``method_parameters`` of an SCR bundle.
+
+    ``grid``: rows and columns of cells. ``starts``: poses tx ty tz qx qy qz qw from which the
+    solver starts. ``damping``: deviation per DoF (m, rad) that damps its steps.
+    ``deviation_floor``: smallest deviation per DoF (m, rad) in the scores. ``limits``: frames
+    beyond them get no interval; null accepts every frame.
+    """
+
+    grid: tuple[Annotated[int, Meta(ge=1, le=1024)], Annotated[int, Meta(ge=1, le=1024)]]
+    starts: Annotated[tuple[Seven, ...], Meta(min_length=1, max_length=64)]
+    damping: SixPositive
+    deviation_floor: SixPositive
+    limits: Signs | None
+
+
+class ScrHead(Head):
+    """Score, ellipsoid and intervals of scene coordinate regression."""
+
+    method = "scr"
+    parameters_type: ClassVar[type[Struct]] = ScrParameters
+    score_names = ("normalised",)
+    one_joint_score = True
+    set_kind = "six at once, an ellipsoid"
+    solves = True
+    parameters: ScrParameters
+
+    def __init__(self, parameters: ScrParameters, score: str) -> None:
+        super().__init__(parameters, score)
+        rows, columns = parameters.grid
+        self.outputs = {"coordinates": (1, rows * columns, 3), "scale_px": (1, rows * columns)}
+        self._floor = np.array(parameters.deviation_floor)
+
+    def check(self, thresholds: Sequence[Threshold], joint: Joint) -> None:
+        """As ``Head``: a single distance for all six DoF in the joint scope."""
+        super().check(thresholds, joint)
+        if joint != "max":
+            raise CalibrationFileError(
+                "calibration.joint: expected max for scr, which has one score for all six DoF, "
+                f"found {joint}"
+            )
+        for entry in thresholds:
+            refuse_negative(entry, "scr")
+            if entry.scope == "joint" and entry.q_hat != (entry.q_hat[0],) * 6:
+                raise CalibrationFileError(
+                    "thresholds.q_hat: expected the same distance six times for scr and scope "
+                    f"joint, found {list(entry.q_hat)} at {entry.confidence}"
+                )
+
+    def solver(self, camera: Camera | None, inputs: PreprocessSpec) -> Solver | None:
+        """As ``Head``: adds ``pose`` (1, 7), ``scale`` (1, 6, 6) and ``signs`` (1, 2)."""
+        if camera is None:
+            raise CalibrationFileError("camera: expected intrinsics for scr, found null")
+        seen = input_camera(camera, inputs.height, inputs.width, inputs.crop)
+        rays = seen.rays(cell_centres(inputs.height, inputs.width, self.parameters.grid))
+        damping = np.array(self.parameters.damping)
+        pose_solver = PoseSolver(rays, np.array(self.parameters.starts), damping)
+        limits = self.parameters.limits
+        count = min(BEST_CELLS, len(rays))
+
+        def solve(outputs: Mapping[str, NDArray[Any]]) -> Solved:
+            scale_px = outputs["scale_px"][0].astype(np.float64)
+            found = pose_solver.solve(outputs["coordinates"][0], scale_px / seen.focal_px)
+            best = np.argpartition(scale_px, count - 1)[:count]
+            squared = found.squared[best]
+            error_px = math.sqrt(np.median(squared * np.square(scale_px[best])))
+            contradicting = np.count_nonzero(squared > _CONTRADICTS**2) / count
+            pose, information, added = self.combined(outputs, found, seen.focal_px)
+            solved = {
+                **outputs,
+                **added,
+                "pose": pose[np.newaxis],
+                "scale": _lower_triangular(np.asarray(np.linalg.inv(information)))[np.newaxis],
+                "signs": np.array([[error_px, contradicting]]),
+            }
+            strange = limits is not None and (
+                not found.last_step < _CONVERGED
+                or error_px > limits.error_px
+                or contradicting > limits.contradicting
+            )
+            return Solved(solved, Reason.IMAGE_UNFAMILIAR if strange else None)
+
+        return solve
+
+    def combined(
+        self, outputs: Mapping[str, NDArray[Any]], found: Solution, focal_px: float
+    ) -> tuple[Array, Array, dict[str, Array]]:
+        """Return pose (7,), information (6, 6) and further outputs; by default the solver's.
+
+        ``focal_px`` is the running camera's focal length in pixels of the model's input.
+        """
+        return found.pose, found.information, {}
+
+    def tuned(
+        self,
+        val: Mapping[str, NDArray[Any]],
+        poses: Array,
+        known: Mapping[str, NDArray[Any]],
+    ) -> ScrParameters:
+        """As ``Head``: limits of the signs, a margin beyond the largest of the known frames."""
+        error_px, contradicting = known["signs"].max(axis=0).tolist()
+        limits = Signs(
+            max(error_px, _LEAST_ERROR_PX) * _MARGIN_ERROR,
+            min(1.0, contradicting + _MARGIN_CONTRADICTING),
+        )
+        return replace(self.parameters, limits=limits)
+
+    def joint_scale(self, scores: Array) -> JointScale:
+        """As ``Head``; one distance needs no scaling."""
+        return LinearScale(np.ones(scores.shape[1:]))
+
+    def scores(
+        self,
+        outputs: Mapping[str, NDArray[Any]],
+        point: Array,
+        truth: Array,
+        scope: Scope = "marginal",
+    ) -> Array:
+        """Outputs stacked over n frames, point and truth (n, 6) -> scores (n, 1, 6)."""
+        scale, deviation = self._floored(outputs["scale"])
+        error = truth - point
+        if scope == "joint":
+            distance = scaled_distance(np.zeros((len(error), 1, 6)), scale, error)
+            return np.tile(distance[:, np.newaxis, np.newaxis], (1, 1, 6))
+        return np.asarray(np.abs(error) / deviation)[:, np.newaxis]
+
+    def conformal_set(
+        self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
+    ) -> ConformalSet:
+        """Outputs and point (6,) of one frame -> six intervals, or an ellipsoid and its hull."""
+        q_hat = infinite_where_null(threshold.q_hat)
+        scale, deviation = self._floored(outputs["scale"])
+        if threshold.scope == "marginal":
+            reach = q_hat * deviation[0]
+            return ConformalSet(point - reach, point + reach)
+        radius = float(q_hat[0])
+        if radius == np.inf:
+            return unbounded_set()
+        # Slightly enlarged, so that rounding leaves no point of the ellipsoid outside its hull.
+        reach = radius * deviation[0] * (1.0 + _HAIR) + _HAIR * np.abs(point)
+        ellipsoid = Ellipsoids(point[np.newaxis], scale[0], radius)
+        return ConformalSet(point - reach, point + reach, ellipsoids=ellipsoid)
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """As ``Head``; other data need other limits."""
+        return (Candidate(self.score, replace(self.parameters, limits=None)),)
+
+    def joint_description(self, joint: Joint) -> str:
+        """As ``Head``."""
+        return "distance by the solver's covariance"
+
+    def _floored(self, scale: NDArray[Any]) -> tuple[Array, Array]:
+        """Scales (..., 6, 6) -> scales with enlarged rows, and deviations (..., 6)."""
+        deviation = np.sqrt(np.square(scale).sum(axis=-1))
+        floored = np.maximum(deviation, self._floor)
+        return scale * (floored / deviation)[..., np.newaxis], floored
+
+
+def _lower_triangular(covariance: Array) -> Array:
+    """Return the Cholesky factor (6, 6); NaN if rounding made the covariance indefinite."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariance))
+    except np.linalg.LinAlgError:
+        return np.full((6, 6), np.nan)

@@ -1,0 +1,146 @@
+"""Scene coordinates and a regressed pose from one backbone, fused in the runtime.
+
+After scene coordinate regression has been trained (``cvo_export.networks.heads.scr``), the network
+of conformalized joint prediction learns the pose from the same last map, averaged to a coarse grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from cvo_edge.heads import Candidate
+from cvo_edge.heads.fused import FusedParameters
+from cvo_export.networks.backbone import averaging
+from cvo_export.networks.heads.base import (
+    Examples,
+    ExportedHead,
+    Lessons,
+    Method,
+    Schedule,
+    Setting,
+)
+from cvo_export.networks.heads.cjp import CjpConfig, CjpLearner, CjpNetwork
+from cvo_export.networks.heads.scr import METHOD as SCR
+from cvo_export.networks.heads.scr import ScrConfig, ScrHead, restored_scr, trained_scr
+from cvo_export.networks.standardised import PoseDecoder
+from cvo_export.networks.stem import Upper
+
+Array = NDArray[np.float64]
+
+_GRID = (3, 4)
+_REGRESSION = CjpConfig()
+_REGRESSION_STEPS = 6000
+
+
+class FusedConfig(ScrConfig, frozen=True, tag="fused", tag_field="method"):
+    """Options of the cells' network; the regression has CJP's defaults."""
+
+
+class Pooled(nn.Module):
+    """Last map (n, channels, rows, columns) -> its means over a 3x4 grid, (n, size)."""
+
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        super().__init__()
+        channels, rows, columns = shape
+        self.register_buffer("rows", averaging(rows, min(_GRID[0], rows)))
+        self.register_buffer("columns", averaging(columns, min(_GRID[1], columns)).T)
+        self.rows: Tensor
+        self.columns: Tensor
+        self.size = channels * self.rows.shape[0] * self.columns.shape[1]
+
+    def forward(self, deep: Tensor) -> Tensor:
+        """Shape (n, channels, rows, columns) -> (n, size)."""
+        return (self.rows @ deep @ self.columns).flatten(1)
+
+
+class FusedHead(ExportedHead):
+    """Map of the stem -> the outputs of SCR, regression (n, 7) and half_width (n, 6)."""
+
+    output_names = ("coordinates", "scale_px", "regression", "half_width")
+    runtime_method = "fused"
+    rotation = "tangent_predicted"
+
+    def __init__(
+        self, scr: ScrHead, regression: CjpNetwork, setting: Setting, focal_px: float
+    ) -> None:
+        super().__init__()
+        self.scr, self.regression = scr, regression
+        self.pooled = Pooled(scr.upper.shape)
+        self.decoder = PoseDecoder(setting.target)
+        self.register_buffer("focal_px", torch.tensor(focal_px, dtype=torch.float64))
+        self.focal_px: Tensor
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return coordinates, scales, regressed pose and half-widths, m and rad."""
+        upper = self.scr.upper
+        deep = upper.deep(features)
+        points, log_scale = self.scr.network(upper.cells(features, deep))
+        point, lower, upper_bound = (
+            self.decoder(values) for values in self.regression(self.pooled(deep))
+        )
+        half_width = 0.5 * (upper_bound - lower)
+        return points, torch.exp(log_scale), self.decoder.pose(point), half_width
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Return the only score."""
+        alone = self.scr.candidates()[0].parameters
+        fields = {name: getattr(alone, name) for name in alone.__struct_fields__}
+        parameters = FusedParameters(**fields, focal_px=float(self.focal_px), fusion=None)
+        return (Candidate("normalised", parameters),)
+
+
+def _train(lessons: Lessons, config: FusedConfig) -> FusedHead:
+    scr = trained_scr(lessons, config)
+    place, target = lessons.place(), lessons.setting.target
+    pooled = Pooled(scr.upper.shape)
+    maps, poses = lessons.features()
+    val_maps, val_poses = lessons.val()
+    # The regression learns one focal length.
+    own = np.flatnonzero(np.equal(place.zooms, 1.0))
+    features = np.stack([_features(scr.upper, pooled, maps[copy]) for copy in own])
+    learner = lessons.learn(
+        "cjp",
+        lambda: CjpLearner(pooled.size, _REGRESSION),
+        examples=Examples(
+            features,
+            target.standardised(poses[own]),
+            torch.from_numpy(_features(scr.upper, pooled, val_maps.numpy())).float(),
+            target.standardised(val_poses),
+        ),
+        schedule=Schedule(_REGRESSION_STEPS, 64, 1e-3),
+        candidate=False,
+    )
+    return FusedHead(scr, learner.network, lessons.setting, place.focal_px)
+
+
+def _features(upper: Upper, pooled: Pooled, maps: NDArray[Any]) -> NDArray[np.float16]:
+    """Maps of the stem (n, ...) -> pooled features of the last map (n, size)."""
+    with torch.no_grad():
+        parts = torch.split(torch.from_numpy(maps), 64)
+        return torch.cat([pooled(upper.deep(part.float())).half() for part in parts]).numpy()
+
+
+def _restore(setting: Setting, config: FusedConfig, state: Mapping[str, Tensor]) -> FusedHead:
+    own = {name.removeprefix("scr."): v for name, v in state.items() if name.startswith("scr.")}
+    scr = restored_scr(setting, config, own)
+    size = Pooled(scr.upper.shape).size
+    head = FusedHead(scr, CjpNetwork(size, _REGRESSION), setting, float(state["focal_px"]))
+    head.load_state_dict(state)
+    return head
+
+
+METHOD = Method(
+    FusedConfig,
+    _train,
+    _restore,
+    cells=True,
+    copies=2 * SCR.copies,
+    steps=SCR.steps,
+    augment=SCR.augment,
+)

@@ -1,0 +1,136 @@
+"""The pose solver: exact on exact points, robust to wrong ones, and honest about its covariance."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from cvo_edge import geometry
+from cvo_edge.camera import Camera, cell_centres
+from cvo_edge.pose import Chart
+from cvo_edge.pose_solver import NU, PoseSolver
+
+CAMERA = Camera(width=256, height=192, fx=234.0, fy=234.0, cx=127.5, cy=95.5)
+RAYS = CAMERA.rays(cell_centres(192, 256, (12, 16)))
+DEVIATION = np.array([0.5, 0.5, 0.5, 0.4, 0.4, 0.4])
+CHART = Chart("tangent_predicted")
+
+
+def pose_near(generator, spread_m=0.15, spread_rad=0.15):
+    q = geometry.quaternion_exp(generator.normal(0.0, spread_rad, 3))
+    return np.concatenate([generator.normal(0.0, spread_m, 3), q])
+
+
+def points_of(pose, generator, noise_px=0.0):
+    """World points (n, 3) on the rays of a camera at ``pose``, at depths of 1 to 4 m."""
+    seen = RAYS + generator.standard_t(NU, RAYS.shape) * noise_px / CAMERA.fx
+    depth = generator.uniform(1.0, 4.0, (len(RAYS), 1))
+    in_camera = np.column_stack([seen, np.ones(len(RAYS))]) * depth
+    return in_camera @ geometry.quaternion_to_matrix(pose[3:]).T + pose[:3]
+
+
+def solver(starts=None):
+    identity = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    return PoseSolver(RAYS, identity if starts is None else starts, DEVIATION)
+
+
+def error(truth, found):
+    return CHART.coordinates(truth, found) - CHART.coordinates(found, found)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_exact_points_give_the_exact_pose(seed):
+    generator = np.random.default_rng(seed)
+    truth = pose_near(generator)
+    found = solver().solve(points_of(truth, generator), np.full(len(RAYS), 1.0 / CAMERA.fx))
+    np.testing.assert_allclose(error(truth, found.pose), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_third_of_wrong_points_does_not_matter(seed):
+    generator = np.random.default_rng(seed)
+    truth = pose_near(generator)
+    points = points_of(truth, generator, 0.5)
+    wrong = generator.permutation(len(points))[: len(points) // 3]
+    points[wrong] += generator.normal(0.0, 1.0, (len(wrong), 3))
+    found = solver().solve(points, np.full(len(RAYS), 1.0 / CAMERA.fx))
+    assert np.linalg.norm(error(truth, found.pose)[:3]) < 0.01
+
+
+def test_the_pose_maximises_the_likelihood():
+    """A general optimiser, started at the solution, finds nothing better."""
+    generator = np.random.default_rng(3)
+    truth = pose_near(generator)
+    points = points_of(truth, generator, 1.0)
+    scale = generator.uniform(0.5, 3.0, len(points)) / CAMERA.fx
+    found = solver().solve(points, scale)
+
+    def loss(step):
+        q = geometry.quaternion_multiply(found.pose[3:], geometry.quaternion_exp(step[3:]))
+        R = geometry.quaternion_to_matrix(q)
+        Y = (points - found.pose[:3] - step[:3]) @ R
+        squared = np.square((Y[:, :2] / Y[:, 2:] - RAYS) / scale[:, None]).sum(axis=1)
+        return (NU + 2.0) / 2.0 * np.log1p(squared / NU).sum()
+
+    best = minimize(loss, np.zeros(6), method="BFGS", options={"gtol": 1e-9})
+    assert np.abs(best.x).max() < 1e-5
+    assert found.last_step < 1e-4
+
+
+def test_the_information_predicts_the_errors():
+    """Over many frames, errors divided by the stated deviation have deviation 1."""
+    generator = np.random.default_rng(4)
+    z = []
+    for _ in range(300):
+        truth = pose_near(generator)
+        found = solver().solve(points_of(truth, generator, 1.0), np.full(len(RAYS), 1 / CAMERA.fx))
+        factor = np.linalg.cholesky(found.information)
+        z.append(factor.T @ error(truth, found.pose))
+    assert 0.9 < np.std(z) < 1.1
+
+
+def test_the_nearest_start_reaches_poses_all_around():
+    generator = np.random.default_rng(5)
+    turns = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    starts = np.array(
+        [[0, 0, 0, *geometry.quaternion_exp([0.0, turn, 0.0])] for turn in turns], float
+    )
+    for turn in generator.uniform(0.0, 2.0 * np.pi, 20):
+        q = geometry.quaternion_multiply(
+            geometry.quaternion_exp([0.0, turn, 0.0]),
+            geometry.quaternion_exp(generator.normal(0.0, 0.1, 3)),
+        )
+        truth = np.array([*generator.normal(0.0, 0.3, 3), *geometry.quaternion_normalise(q)])
+        found = solver(starts).solve(points_of(truth, generator, 0.5), np.full(len(RAYS), 1 / 234))
+        assert np.linalg.norm(error(truth, found.pose)) < 0.05
+
+
+def test_a_tiny_change_of_the_points_makes_a_tiny_change_of_the_pose():
+    generator = np.random.default_rng(6)
+    scale = np.full(len(RAYS), 1.0 / CAMERA.fx)
+    for _ in range(50):
+        points = points_of(pose_near(generator), generator, 2.0)
+        found = solver().solve(points, scale)
+        moved = points * (1.0 + 1e-6 * generator.standard_normal(points.shape))
+        other = solver().solve(moved, scale)
+        assert np.abs(error(found.pose, other.pose)).max() < 1e-4
+
+
+def test_cells_without_a_ray_have_no_weight():
+    generator = np.random.default_rng(7)
+    truth = pose_near(generator)
+    points = points_of(truth, generator)
+    rays = RAYS.copy()
+    rays[::5] = np.nan
+    points[::5] = 1e3
+    identity = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    found = PoseSolver(rays, identity, DEVIATION).solve(points, np.full(len(rays), 1 / CAMERA.fx))
+    np.testing.assert_allclose(error(truth, found.pose), 0.0, atol=1e-6)
+    assert not found.squared[::5].any()
+
+
+@pytest.mark.parametrize("value", [0.0, 1e8, -1e8])
+def test_senseless_points_still_give_a_finite_answer(value):
+    found = solver().solve(np.full((len(RAYS), 3), value), np.full(len(RAYS), 1.0 / CAMERA.fx))
+    assert np.isfinite(found.pose).all()
+    assert np.isfinite(found.information).all()
+    assert (np.linalg.eigvalsh(found.information) > 0.0).all()

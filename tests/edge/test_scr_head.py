@@ -1,0 +1,237 @@
+"""Heads that solve for the pose: cameras, signs of doubt, sets and fusion."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from cvo_edge import geometry
+from cvo_edge.bundle.format import PreprocessSpec, Threshold
+from cvo_edge.camera import Camera, cell_centres
+from cvo_edge.conformal import conformal_quantile
+from cvo_edge.errors import CalibrationFileError
+from cvo_edge.estimate import Reason
+from cvo_edge.heads.fused import FusedHead, FusedParameters, Fusion, fused
+from cvo_edge.heads.scr import ScrHead, ScrParameters, Signs
+from cvo_edge.input.preprocess import input_camera
+from cvo_edge.pose import Chart
+
+INPUTS = PreprocessSpec(
+    height=192,
+    width=256,
+    colour_order="rgb",
+    interpolation="halve_then_linear_exact",
+    crop="none",
+    mean=(0.5, 0.5, 0.5),
+    std=(0.5, 0.5, 0.5),
+    layout="nhwc",
+    in_graph=("cast", "transpose", "normalise"),
+)
+CAMERA = Camera(width=640, height=480, fx=585.0, fy=585.0, cx=319.5, cy=239.5)
+FISHEYE = msgspec.structs.replace(
+    CAMERA, fx=300.0, fy=300.0, distortion="equidistant", coefficients=(0.01, 0.0, 0.0, 0.0)
+)
+GRID = (12, 16)
+PARAMETERS = ScrParameters(
+    grid=GRID,
+    starts=((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),),
+    damping=(1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+    deviation_floor=(1e-4,) * 6,
+    limits=Signs(error_px=4.0, contradicting=0.3),
+)
+CHART = Chart("tangent_predicted")
+
+
+def pose_near(generator):
+    q = geometry.quaternion_exp(generator.normal(0.0, 0.1, 3))
+    return np.concatenate([generator.normal(0.0, 0.1, 3), q])
+
+
+def outputs_of(camera, pose, generator, noise_px=0.5):
+    """What a network would predict for an image that ``camera`` takes at ``pose``."""
+    seen = input_camera(camera, INPUTS.height, INPUTS.width, INPUTS.crop)
+    centres = cell_centres(INPUTS.height, INPUTS.width, GRID)
+    rays = seen.rays(centres + generator.normal(0.0, noise_px, centres.shape))
+    depth = generator.uniform(1.0, 4.0, (len(rays), 1))
+    points = np.column_stack([rays, np.ones(len(rays))]) * depth
+    world = points @ geometry.quaternion_to_matrix(pose[3:]).T + pose[:3]
+    return {
+        "coordinates": world[np.newaxis].astype(np.float32),
+        "scale_px": np.full((1, len(rays)), noise_px, np.float32),
+    }
+
+
+def error(truth, found):
+    return CHART.coordinates(truth, found) - CHART.coordinates(found, found)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        CAMERA,
+        CAMERA.zoomed(1.4),
+        CAMERA.cropped(40, 400, 100, 580),
+        FISHEYE,
+        CAMERA.scaled(320, 240),
+    ],
+)
+def test_any_camera_works_if_it_is_given(camera):
+    generator = np.random.default_rng(0)
+    solve = ScrHead(PARAMETERS, "normalised").solver(camera, INPUTS)
+    for _ in range(10):
+        truth = pose_near(generator)
+        found, doubt = solve(outputs_of(camera, truth, generator))
+        assert doubt is None
+        assert np.abs(error(truth, found["pose"][0])).max() < 0.02
+
+
+@pytest.mark.parametrize("other", [CAMERA.zoomed(1.4), FISHEYE])
+def test_another_camera_is_doubted_if_it_is_not_given(other):
+    generator = np.random.default_rng(0)
+    solve = ScrHead(PARAMETERS, "normalised").solver(CAMERA, INPUTS)
+    for _ in range(10):
+        _, doubt = solve(outputs_of(other, pose_near(generator), generator))
+        assert doubt is Reason.IMAGE_UNFAMILIAR
+
+
+def test_points_of_no_place_are_doubted():
+    generator = np.random.default_rng(0)
+    solve = ScrHead(PARAMETERS, "normalised").solver(CAMERA, INPUTS)
+    for scale in (0.3, 3.0, 30.0):
+        points = generator.normal(0.0, 2.0, (1, 192, 3)).astype(np.float32)
+        scales = np.full((1, 192), scale, np.float32)
+        assert solve({"coordinates": points, "scale_px": scales}).doubt is Reason.IMAGE_UNFAMILIAR
+
+
+def test_without_intrinsics_it_is_refused():
+    with pytest.raises(CalibrationFileError, match="camera: expected intrinsics for scr, found"):
+        ScrHead(PARAMETERS, "normalised").solver(None, INPUTS)
+
+
+def test_limits_accept_every_known_frame():
+    generator = np.random.default_rng(0)
+    head = ScrHead(msgspec.structs.replace(PARAMETERS, limits=None), "normalised")
+    solve = head.solver(CAMERA, INPUTS)
+    frames = [outputs_of(CAMERA, pose_near(generator), generator) for _ in range(50)]
+    known = {"signs": np.concatenate([solve(frame).outputs["signs"] for frame in frames])}
+    tuned = ScrHead(head.tuned(known, np.empty((0, 7)), known), "normalised")
+    again = tuned.solver(CAMERA, INPUTS)
+    assert all(again(frame).doubt is None for frame in frames)
+    assert tuned.candidates()[0].parameters.limits is None
+
+
+@pytest.mark.parametrize("scope", ["marginal", "joint"])
+def test_the_set_holds_exactly_the_poses_with_a_smaller_score(scope):
+    generator = np.random.default_rng(1)
+    head = ScrHead(PARAMETERS, "normalised")
+    solve = head.solver(CAMERA, INPUTS)
+    point = np.zeros(6)
+    threshold = Threshold(confidence=0.9, scope=scope, q_hat=(2.0,) * 6, q_hat_upper=None)
+    for _ in range(50):
+        outputs = solve(outputs_of(CAMERA, pose_near(generator), generator)).outputs
+        found = head.conformal_set(outputs, point, threshold)
+        deviation = np.sqrt(np.square(outputs["scale"][0]).sum(axis=1))
+        y = point + generator.normal(0.0, 1.5, 6) * deviation
+        scores = head.scores(outputs, point[np.newaxis], y[np.newaxis], scope)[0, 0]
+        if scope == "marginal":
+            np.testing.assert_array_equal(found.covers(y), scores <= 2.0)
+        else:
+            assert found.contains(y) == (scores[0] <= 2.0)
+            assert not found.contains(y) or found.covers(y).all()
+
+
+FUSED = FusedParameters(
+    **{name: getattr(PARAMETERS, name) for name in PARAMETERS.__struct_fields__},
+    focal_px=585.0 * 0.4,
+    fusion=None,
+)
+
+
+def regression_of(truth, generator, deviation):
+    step = deviation * generator.standard_normal(6)
+    q = geometry.quaternion_multiply(truth[3:], geometry.quaternion_exp(step[3:]))
+    return np.concatenate([truth[:3] + step[:3], q])
+
+
+def fused_frames(generator, count, deviation):
+    """Outputs of the fused network, with a regression of this deviation, and true poses."""
+    solve = FusedHead(FUSED, "normalised").solver(CAMERA, INPUTS)
+    truths, found = [], []
+    for _ in range(count):
+        truth = pose_near(generator)
+        outputs = outputs_of(CAMERA, truth, generator, noise_px=2.0)
+        regression = regression_of(truth, generator, deviation)
+        outputs["regression"] = regression[np.newaxis].astype(np.float32)
+        outputs["half_width"] = np.tile(1.7 * deviation, (1, 1)).astype(np.float32)
+        truths.append(truth)
+        found.append(solve(outputs).outputs)
+    stacked = {name: np.concatenate([each[name] for each in found]) for name in found[0]}
+    return stacked, np.array(truths), found
+
+
+def position_error(solve, frames, truths):
+    poses = [solve(frame).outputs["pose"][0] for frame in frames]
+    return np.median(np.linalg.norm(np.array(poses)[:, :3] - truths[:, :3], axis=1))
+
+
+def test_two_poses_are_better_than_either():
+    generator = np.random.default_rng(2)
+    deviation = np.array([0.005, 0.005, 0.005, 0.002, 0.002, 0.002])
+    val, truths, frames = fused_frames(generator, 200, deviation)
+    tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val)
+    assert tuned.fusion.share > 0.0
+    together = position_error(FusedHead(tuned, "normalised").solver(CAMERA, INPUTS), frames, truths)
+    solved = position_error(FusedHead(FUSED, "normalised").solver(CAMERA, INPUTS), frames, truths)
+    regressed = np.median(np.linalg.norm(val["regression"][:, :3] - truths[:, :3], axis=1))
+    assert together < 0.9 * min(solved, regressed)
+
+
+def test_a_useless_regression_does_no_harm():
+    generator = np.random.default_rng(3)
+    val, truths, frames = fused_frames(generator, 200, np.full(6, 0.5))
+    tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val)
+    together = position_error(FusedHead(tuned, "normalised").solver(CAMERA, INPUTS), frames, truths)
+    solved = position_error(FusedHead(FUSED, "normalised").solver(CAMERA, INPUTS), frames, truths)
+    assert together < 1.02 * solved
+
+
+def test_the_regression_is_left_out_with_another_focal_length():
+    generator = np.random.default_rng(4)
+    fusion = Fusion(kappa=1.0, rho=(1e-3,) * 6, share=1.0)
+    head = FusedHead(msgspec.structs.replace(FUSED, fusion=fusion), "normalised")
+    other = CAMERA.zoomed(1.2)
+    truth = pose_near(generator)
+    outputs = outputs_of(other, truth, generator)
+    outputs["regression"] = np.array([[9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 1.0]], np.float32)
+    outputs["half_width"] = np.full((1, 6), 0.01, np.float32)
+    found = head.solver(other, INPUTS)(outputs).outputs["pose"][0]
+    assert np.abs(error(truth, found)).max() < 0.02
+
+
+def test_disagreement_widens_the_covariance():
+    solved = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    fusion = Fusion(kappa=1.0, rho=(1.0,) * 6, share=1.0)
+    variances = []
+    for offset in (0.0, 0.1, 1.0):
+        regression = solved.copy()
+        regression[0] = offset
+        pose, information = fused(solved, 1e4 * np.eye(6), regression, np.full(6, 0.01), fusion)
+        assert pose[0] == pytest.approx(offset / 2)
+        variances.append(np.linalg.inv(information)[0, 0])
+    assert variances[0] == pytest.approx(0.5e-4)
+    assert variances[0] < variances[1] < variances[2]
+
+
+def test_coverage_of_exchangeable_frames():
+    generator = np.random.default_rng(5)
+    head = ScrHead(msgspec.structs.replace(PARAMETERS, limits=None), "normalised")
+    solve = head.solver(CAMERA, INPUTS)
+    scores = []
+    for _ in range(600):
+        truth = pose_near(generator)
+        outputs = solve(outputs_of(CAMERA, truth, generator)).outputs
+        point = np.zeros((1, 6))
+        point[0, :3] = outputs["pose"][0, :3]
+        scores.append(head.scores(outputs, point, CHART.coordinates(truth, outputs["pose"]))[0, 0])
+    scores = np.array(scores)
+    q_hat = np.array([conformal_quantile(column, 0.9) for column in scores[:300].T])
+    assert np.abs((scores[300:] <= q_hat).mean(axis=0) - 0.9).max() < 0.06
