@@ -16,6 +16,7 @@ from cvo_edge.vocabulary import VERSION
 
 if TYPE_CHECKING:
     from cvo_edge.bundle.format import Calibration
+    from cvo_edge.camera import Camera, read_camera
     from cvo_edge.engine.loading import Bundle, read_bundle
     from cvo_edge.engine.model_cache import ModelCache
     from cvo_edge.errors import (
@@ -43,6 +44,7 @@ __all__ = [
     "BundleMismatchError",
     "Calibration",
     "CalibrationFileError",
+    "Camera",
     "Chart",
     "ConformalSet",
     "CvoError",
@@ -64,6 +66,7 @@ __all__ = [
     "UsageError",
     "open_source",
     "read_bundle",
+    "read_camera",
     "read_records",
 ]
 
@@ -72,6 +75,7 @@ _HOMES = {
     "BundleMismatchError": "errors",
     "Calibration": "bundle.format",
     "CalibrationFileError": "errors",
+    "Camera": "camera",
     "Chart": "pose",
     "ConformalSet": "sets",
     "CvoError": "errors",
@@ -93,6 +97,7 @@ _HOMES = {
     "UsageError": "errors",
     "open_source": "input.sources",
     "read_bundle": "engine.loading",
+    "read_camera": "camera",
     "read_records": "output.records",
 }
 

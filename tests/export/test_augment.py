@@ -1,15 +1,17 @@
 """Augmentation by camera rotation: the homography matches the label."""
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
 from cvo_edge import geometry
+from cvo_edge.camera import Camera
 from cvo_export.data.augment import (
     AugmentConfig,
     augmented,
+    blur,
     change_light,
-    model_intrinsics,
     rotate_camera,
 )
 from cvo_export.datasets import Intrinsics
@@ -17,7 +19,7 @@ from cvo_export.scene.room import room
 
 SIZE = (320, 240)
 K = Intrinsics(292.5, 292.5, 159.5, 119.5)
-MATRIX = np.array([[292.5, 0, 159.5], [0, 292.5, 119.5], [0, 0, 1]])
+CAMERA = Camera(width=320, height=240, **K._asdict())
 # A camera (x right, y down, z forward) that looks along +y of the world (z up).
 LOOKING = geometry.matrix_to_quaternion(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
 
@@ -30,8 +32,8 @@ def test_the_turned_image_is_what_a_turned_camera_renders(rotvec):
     turned = pose.copy()
     turned[3:] = geometry.quaternion_multiply(pose[3:], q_camera)
     expected = room().render(turned, K, SIZE).astype(int)
-    found = rotate_camera(image, MATRIX, q_camera).astype(int)
-    wrong = rotate_camera(image, MATRIX, geometry.quaternion_conjugate(q_camera)).astype(int)
+    found = rotate_camera(image, CAMERA, q_camera).astype(int)
+    wrong = rotate_camera(image, CAMERA, geometry.quaternion_conjugate(q_camera)).astype(int)
     middle = np.s_[60:180, 80:240]
     right = np.abs(found - expected)[middle].mean()
     assert right < 4.0
@@ -43,7 +45,7 @@ def test_augmented_label_is_the_pose_times_the_turn_and_keeps_the_position():
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
     pose = np.concatenate([[1.0, 2.0, 3.0], LOOKING])
     generator = np.random.default_rng(1)
-    _, found = augmented(image, pose, MATRIX, AugmentConfig(6.0, 0.0), generator)
+    _, found = augmented(image, pose, CAMERA, AugmentConfig(6.0, 0.0), generator)
     np.testing.assert_array_equal(found[:3], pose[:3])
     turn = geometry.quaternion_multiply(geometry.quaternion_conjugate(pose[3:]), found[3:])
     expected = np.deg2rad(6.0) * np.random.default_rng(1).standard_normal(3)
@@ -54,7 +56,7 @@ def test_no_strength_changes_nothing():
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
     pose = np.concatenate([[1.0, 2.0, 3.0], LOOKING])
     config = AugmentConfig(6.0, 1.0).graded(0.0)
-    found, same = augmented(image, pose, MATRIX, config, np.random.default_rng(0))
+    found, same = augmented(image, pose, CAMERA, config, np.random.default_rng(0))
     np.testing.assert_array_equal(found, image)
     np.testing.assert_array_equal(same, pose)
 
@@ -75,19 +77,45 @@ def test_light_changes_more_with_strength():
     assert means == sorted(means)
 
 
-def test_intrinsics_follow_resize_and_crop():
-    """A ray passes through corresponding places of the camera image and the model input."""
-    for shape, height, width, crop in (
-        ((480, 640), 192, 256, "none"),
-        ((480, 800), 192, 256, "centre"),
-        ((480, 640), 120, 120, "none"),
-    ):
-        camera = Intrinsics(585.0, 580.0, 0.5 * shape[1], 0.48 * shape[0])
-        found = model_intrinsics(camera, shape, height, width, crop)
-        left = (shape[1] - min(shape[1], shape[0] * width // height)) // 2 if crop != "none" else 0
-        cropped = shape[1] - 2 * left
-        ray = np.array([0.1, -0.05, 1.0])
-        pixel = np.array([camera.fx * 0.1 + camera.cx, camera.fy * -0.05 + camera.cy])
-        # Coordinates in which pixel centres are at one half scale exactly.
-        scaled = (pixel + 0.5 - [left, 0]) * [width / cropped, height / shape[0]] - 0.5
-        np.testing.assert_allclose((found @ ray)[:2], scaled, atol=1e-9)
+def test_a_turned_lens_sees_what_the_turned_rays_meet():
+    """With distortion, each pixel of the turned image shows the old pixel on its turned ray."""
+    lens = msgspec.structs.replace(
+        CAMERA, distortion="radial_tangential", coefficients=(-0.25, 0.06, 1e-3, -5e-4)
+    )
+    # The image of coordinates: its value is where a pixel was.
+    y, x = np.mgrid[: lens.height, : lens.width]
+    image = np.stack([x / 2, y, np.zeros_like(x)], axis=-1).astype(np.uint8)
+    q_camera = geometry.quaternion_exp([0.03, -0.04, 0.05])
+    found = rotate_camera(image, lens, q_camera, zoom=1.1).astype(float)
+    pixels = np.array([[160.0, 120.0], [200.0, 90.0], [120.0, 150.0]])
+    rays = lens.zoomed(1.1).rays(pixels)
+    ahead = np.column_stack([rays, np.ones(3)]) @ geometry.quaternion_to_matrix(q_camera).T
+    expected = lens.project(ahead)
+    for (column, row), (old_x, old_y) in zip(pixels.astype(int), expected, strict=True):
+        assert found[row, column, 0] == pytest.approx(old_x / 2, abs=1.0)
+        assert found[row, column, 1] == pytest.approx(old_y, abs=1.0)
+
+
+def test_a_zoomed_image_is_what_a_zoomed_camera_renders():
+    pose = np.concatenate([[0.0, 0.0, 1.3], LOOKING])
+    image = room().render(pose, K, SIZE)
+    zoomed = Intrinsics(1.2 * K.fx, 1.2 * K.fy, K.cx, K.cy)
+    expected = room().render(pose, zoomed, SIZE).astype(int)
+    found = rotate_camera(image, CAMERA, np.array([0.0, 0.0, 0.0, 1.0]), 1.2).astype(int)
+    assert np.abs(found - expected).mean() < 0.35 * np.abs(image.astype(int) - expected).mean()
+
+
+def test_every_second_copy_has_the_cameras_own_focal_length():
+    zooms = AugmentConfig(zoom=0.2).zooms(8)
+    assert zooms[0::4] == pytest.approx([1.0, np.exp(-0.1), np.exp(-0.2)])
+    assert zooms[1::2] == (1.0,) * 4
+    assert zooms[2] == pytest.approx(np.exp(0.05))
+    assert set(AugmentConfig().zooms(5)) == {1.0}
+
+
+def test_blur_keeps_the_mean_and_every_third_image_has_it():
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    blurred = [blur(image, 6.0, np.random.default_rng(seed)) for seed in range(300)]
+    changed = [not np.array_equal(each, image) for each in blurred]
+    assert 70 < sum(changed) < 130
+    assert np.mean(blurred) == pytest.approx(image.mean(), rel=0.02)

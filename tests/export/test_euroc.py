@@ -97,6 +97,9 @@ def test_images_are_bgr_and_the_camera_is_that_of_sensor_yaml(tmp_path):
     assert found.read_image(3).shape == (48, 64, 3)
     assert found.read_image(3)[0, 0].tolist() == [3, 3, 3]
     assert found.intrinsics == (40.5, 40.25, 31.5, 24.75)
+    assert found.lens.distortion == "radial_tangential"
+    assert found.camera().coefficients == found.lens.coefficients != ()
+    assert (found.camera().width, found.camera().height) == (64, 48)
 
 
 def test_the_first_line_of_opencv_is_passed_over(tmp_path):
@@ -113,9 +116,11 @@ def test_intrinsics_of_no_camera_are_refused(tmp_path, number):
         open_euroc(str(folder))
 
 
-def test_a_fisheye_is_no_pinhole(tmp_path):
+def test_a_fisheye_has_an_equidistant_lens_and_other_models_are_unknown(tmp_path):
     folder = recording(tmp_path / "a", stamps(1))
     edit(sensor(folder), "radial-tangential", "equidistant")
+    assert open_euroc(str(folder)).lens.distortion == "equidistant"
+    edit(sensor(folder), "equidistant", "double-sphere")
     assert open_euroc(str(folder)).intrinsics is None
 
 

@@ -25,7 +25,7 @@ def built(flights, images):
 
 
 def made(images, poses, camera, seed=0):
-    return sparse_map(images.__getitem__, poses, camera, seed, lambda done, total: None)
+    return sparse_map(images.__getitem__, poses, camera, seed, lambda *_: None)
 
 
 def test_points_reproject_onto_other_images_of_the_scene(flights, images, built):

@@ -120,6 +120,8 @@ def test_cameras_are_known_by_the_name_of_the_folder(tmp_path, name, camera):
     assert found == (camera if camera is None else pytest.approx([v / 10 for v in camera]))
     write_images(folder, (480, 640))
     assert open_tum(str(folder)).intrinsics == camera
+    undistorted = camera is None or camera[0] == 535.4
+    assert (open_tum(str(folder)).lens.distortion == "none") == undistorted
 
 
 def test_a_folder_of_sequences_is_one_data_set(tmp_path):

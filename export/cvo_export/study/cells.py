@@ -268,8 +268,9 @@ def digest(config: TrainConfig) -> str:
 
 
 def _features_of(config: TrainConfig) -> bytes:
-    """Return the options that determine a run's features: all but its method."""
-    return msgspec.json.encode({**msgspec.to_builtins(config), "head": None, "steps": 0})
+    """Return the options that determine a run's features: all but its method and its steps."""
+    others = {**msgspec.to_builtins(config), "head": config.cells, "steps": 0}
+    return msgspec.json.encode(others)
 
 
 class _Clock:

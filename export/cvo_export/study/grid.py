@@ -26,7 +26,7 @@ from cvo_export.data.splits import default_kind
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.datasets.describe import summary
 from cvo_export.files import write_json
-from cvo_export.networks.backbone import TIMM_WEIGHTS, Backbone, load_weights
+from cvo_export.networks.backbone import TIMM_WEIGHTS
 from cvo_export.progress import Progress
 from cvo_export.study.cell import CONFIDENCE, Cell
 from cvo_export.study.cells import CellFolder, Say
@@ -34,7 +34,7 @@ from cvo_export.study.frame_times import Timing, timed
 from cvo_export.study.workers import Engine
 from cvo_export.training.configure import configure
 from cvo_export.training.loop import check_roles
-from cvo_export.training.run import TrainConfig
+from cvo_export.training.run import TrainConfig, loaded_backbone
 
 RESULTS_FILE = "results.json"
 
@@ -244,13 +244,13 @@ def _add(plan: Plan, grid: Grid) -> None:
 def _check_networks(configs: Iterable[TrainConfig]) -> None:
     """Raise UsageError if a backbone cannot be built, or if the weights do not fit it."""
     distinct = {
-        msgspec.json.encode((c.backbone, c.height, c.width, c.weights)): c
+        msgspec.json.encode((c.backbone, c.height, c.width, c.weights, c.cells)): c
         for c in configs
         # Weights from timm would have to be downloaded.
         if c.weights != TIMM_WEIGHTS
     }
     for config in distinct.values():
-        load_weights(Backbone(config.backbone, config.height, config.width), config.weights)
+        loaded_backbone(config, config.weights)
 
 
 def _labels(opened: Mapping[str, PoseDataset]) -> dict[str, str]:

@@ -90,7 +90,7 @@ def shared_folder(
     """
     decisive = {
         "weights": weights_sha256,
-        "backbone": msgspec.to_builtins(config.backbone),
+        "backbone": [msgspec.to_builtins(config.backbone), config.cells],
         "image": [config.height, config.width, config.crop],
         "augment": [msgspec.to_builtins(config.augment), config.copies, config.seed],
         "camera": msgspec.to_builtins(images.camera),

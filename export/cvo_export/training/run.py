@@ -83,6 +83,11 @@ class TrainConfig:
         """Name of the method or baseline: the tag of its options."""
         return str(self.head.__struct_config__.tag)
 
+    @property
+    def cells(self) -> bool:
+        """Whether the method reads the map of a stem and trains the stages after it."""
+        return TRAINABLE[self.method].cells
+
 
 def decode_config(content: bytes) -> TrainConfig:
     """Decode the content of ``config.json``; raises msgspec.MsgspecError if it is invalid.
@@ -178,7 +183,7 @@ def loaded_backbone(
     UsageError.
     """
     size = config.height, config.width
-    if TRAINABLE[config.method].cells:
+    if config.cells:
         return split_backbone(config.backbone, *size, weights)
     backbone = Backbone(config.backbone, *size)
     return backbone, None, load_weights(backbone, weights)

@@ -1,0 +1,194 @@
+"""Scene coordinate regression and the fusion, from training to bundle."""
+
+import numpy as np
+import pytest
+import torch
+
+from cvo_edge import Odometer
+from cvo_edge.engine.loading import read_bundle
+from cvo_edge.errors import UsageError
+from cvo_edge.heads.scr import ScrParameters
+from cvo_edge.pose_solver import NU
+from cvo_export.bundles.thresholds import observe
+from cvo_export.data import place as place_module
+from cvo_export.data.augment import AugmentConfig
+from cvo_export.datasets import open_dataset
+from cvo_export.evaluate import evaluate, find_level
+from cvo_export.networks.backbone import BackboneConfig
+from cvo_export.networks.heads import fused as fused_module
+from cvo_export.networks.heads.fused import FusedConfig
+from cvo_export.networks.heads.scr import ScrConfig, cell_loss, spread_poses
+from cvo_export.networks.stem import split_backbone
+from cvo_export.publish import publish
+from cvo_export.training.loop import train
+from cvo_export.training.run import load_run
+
+from .conftest import ignore_progress, tiny_config
+from .test_train import InterruptedTrainingError, same_weights, stopping_after
+
+pytestmark = pytest.mark.usefixtures("drawn_once")
+
+SCENE = "synthetic:room,flights=6,frames=30,size=192x144"
+CONFIGS = {
+    "scr": ScrConfig(width=48, blocks=1, cell_steps=300),
+    "fused": FusedConfig(width=48, blocks=1, cell_steps=300),
+}
+
+
+def config(method, **changes):
+    values = {
+        "head": CONFIGS[method],
+        "dataset": SCENE,
+        "height": 144,
+        "width": 192,
+        "augment": AugmentConfig(2.0, 0.3, motion_blur=0.3, zoom=0.1),
+        "steps": 100,
+    }
+    return tiny_config(**{**values, **changes})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _short_regression():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fused_module, "_REGRESSION_STEPS", 300)
+        yield
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    made = {}
+
+    def of(method):
+        if method not in made:
+            folder = tmp_path_factory.mktemp("runs") / method
+            run = train(folder, config(method), ignore_progress)
+            bundle = folder.with_name(method + "-bundle")
+            publish(run, bundle, method)
+            made[method] = (folder, run, bundle)
+        return made[method]
+
+    return of
+
+
+@pytest.mark.parametrize("method", list(CONFIGS))
+def test_a_finished_run_is_read_back_and_publishes_the_same_bundle(runs, method, tmp_path):
+    folder, run, bundle = runs(method)
+    again = load_run(folder)
+    assert same_weights(run, again)
+    publish(again, tmp_path / "again", method)
+    first, second = read_bundle(bundle), read_bundle(tmp_path / "again")
+    assert second.calibration.thresholds == first.calibration.thresholds
+    assert second.calibration.method_parameters == first.calibration.method_parameters
+
+
+@pytest.mark.parametrize("stage", ["map", "features", "training"])
+def test_an_interrupted_run_ends_as_if_it_never_was(runs, stage, tmp_path):
+    _, run, _ = runs("scr")
+    # This interrupts the second lesson.
+    first = sum(entry.lesson == "scr-cells" for entry in run.history)
+    calls = {"map": 20, "features": 1, "training": first + 5}[stage]
+    with pytest.raises(InterruptedTrainingError):
+        train(tmp_path / "run", config("scr"), stopping_after(calls, stage))
+    resumed = train(tmp_path / "run", config("scr"), ignore_progress)
+    assert same_weights(run, resumed)
+    assert run.history == resumed.history
+
+
+@pytest.mark.parametrize("method", list(CONFIGS))
+def test_a_bundle_locates_the_camera_and_covers_it(runs, method):
+    _, run, bundle = runs(method)
+    report = evaluate(bundle, run.dataset, "test")
+    spread = float(np.linalg.norm(run.dataset.poses[:, :3].std(axis=0)))
+    assert report["point_error"]["median_m"] < 0.5 * spread
+    assert report["frames"]["invalid"] == 0
+    for scope in ("marginal", "joint"):
+        level = find_level(report["levels"], 0.9, scope)
+        covered = level["coverage"] if scope == "marginal" else [level["joint_coverage"]]
+        assert min(covered) > 0.7
+
+
+def test_the_runtime_solves_for_the_pose_of_torchs_coordinates(runs):
+    _, run, bundle = runs("scr")
+    with Odometer.load(bundle) as odometer:
+        seen = observe(odometer, run.dataset, run.split.roles["test"][:8])
+        parameters = odometer.head.parameters
+    assert isinstance(parameters, ScrParameters)
+    for row, index in enumerate(seen.indices):
+        from cvo_edge.input.preprocess import model_input
+
+        image = model_input(run.dataset.read_image(int(index)), 144, 192, "none")
+        with torch.no_grad():
+            coordinates, scale = run.graph(torch.from_numpy(image))
+        np.testing.assert_allclose(seen.outputs["coordinates"][row], coordinates[0], atol=1e-4)
+        np.testing.assert_allclose(seen.outputs["scale_px"][row], scale[0], rtol=1e-3)
+
+
+def test_another_room_gets_no_interval(runs):
+    _, _, bundle = runs("scr")
+    generator = np.random.default_rng(0)
+    with Odometer.load(bundle) as odometer:
+        for _ in range(10):
+            noise = generator.integers(0, 255, (144, 192, 3)).astype(np.uint8)
+            assert not odometer.step(noise).bounded
+        other = odometer.step(np.zeros((200, 150, 3), np.uint8) + np.arange(150)[:, None] % 251)
+        assert not other.bounded
+
+
+def test_a_data_set_without_a_camera_is_refused(tmp_path, monkeypatch):
+    from cvo_export.datasets.base import PoseDataset
+
+    monkeypatch.setattr(PoseDataset, "camera", lambda self: None)
+    with pytest.raises(UsageError, match="expected the camera's intrinsics for scr, found none"):
+        train(tmp_path / "run", config("scr"), ignore_progress)
+
+
+def test_images_that_are_no_whole_number_of_cells_are_refused():
+    with pytest.raises(UsageError, match=r"size: expected multiples of 16 .*, found 100x96"):
+        split_backbone(BackboneConfig("test_efficientnet"), 96, 100, "none")
+
+
+@pytest.mark.parametrize("name", ["mobilenetv2_050", "resnet18", "mobilenetv3_small_050"])
+def test_a_backbone_is_cut_without_changing_what_it_computes(name):
+    """``split_backbone`` compares both parts with timm's own stages, and refuses a difference."""
+    stem, upper, _ = split_backbone(BackboneConfig(name), 96, 128, "none")
+    image = torch.zeros((2, 96, 128, 3), dtype=torch.uint8)
+    with torch.no_grad():
+        assert upper(stem(image)).shape == (2, 6 * 8, upper.size)
+
+
+def test_the_loss_is_least_at_the_truth():
+    generator = np.random.default_rng(0)
+    count, focal = 64, 200.0
+    y = np.zeros((count, place_module.COLUMNS), np.float32)
+    y[:, place_module.RAY] = generator.uniform(-0.5, 0.5, (count, 2))
+    y[:, place_module.ROTATION] = np.eye(3).ravel()
+    y[:, place_module.SHOWN] = 1.0
+    depth = generator.uniform(1.0, 3.0, count)
+    y[:, place_module.LOG_DEPTH] = np.log(depth)
+    y[:, place_module.DEPTH_WEIGHT] = 1.0
+    truth = np.column_stack([y[:, place_module.RAY], np.ones(count)]) * depth[:, None]
+
+    def loss(points, log_scale=0.0):
+        x = torch.tensor(points, dtype=torch.float32)
+        scales = torch.full((count,), float(log_scale))
+        return float(cell_loss(x, scales, torch.from_numpy(y), focal, 2.0))
+
+    best = loss(truth)
+    for _ in range(20):
+        assert loss(truth + generator.normal(0.0, 0.02, truth.shape)) > best
+    # Points behind the camera, or far off, cost more than any point near the truth.
+    assert loss(-truth) > loss(truth + 0.5) > best
+    # The scale is that of the errors: 2-D Student's t with nu = 3.
+    error = generator.standard_t(NU, (count, 2)) * 4.0 / focal
+    noisy = truth + np.column_stack([error * depth[:, None], np.zeros(count)])
+    losses = [loss(noisy, np.log(scale)) for scale in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)]
+    assert np.argmin(losses) in (2, 3, 4)
+
+
+def test_spread_poses_cover_all_poses():
+    poses = open_dataset("synthetic:room,flights=4,frames=30,size=64x48").poses
+    few, many = (
+        max(np.linalg.norm(poses[:, None, :3] - spread_poses(poses, n)[:, :3], axis=2).min(axis=1))
+        for n in (1, 16)
+    )
+    assert many < 0.6 * few
