@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
@@ -155,6 +156,29 @@ _terminated = threading.Event()
 def _terminate(number: int, _: FrameType | None) -> NoReturn:
     _terminated.set()
     raise Terminated(128 + number)
+
+
+@contextlib.contextmanager
+def signals_deferred() -> Iterator[None]:
+    """Handle SIGINT and SIGTERM after this block only, e.g. while a child process starts.
+
+    A handler that raises between the start of a process and the registration of its clean-up would
+    leave it running. Other threads never run handlers, so nothing is deferred there.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+    kinds = (signal.SIGINT, signal.SIGTERM)
+    before = {kind: signal.signal(kind, lambda number, _: caught.append(number)) for kind in kinds}
+    try:
+        yield
+    finally:
+        for kind, handler in before.items():
+            # None: a handler that was not installed from Python.
+            signal.signal(kind, signal.SIG_DFL if handler is None else handler)
+        for number in caught:
+            signal.raise_signal(number)
 
 
 def end_within_a_second() -> None:

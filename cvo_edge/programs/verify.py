@@ -25,6 +25,7 @@ from cvo_edge.errors import (
     ModelError,
     UsageError,
 )
+from cvo_edge.process import signals_deferred
 
 TIMEOUT_S, SHORTEST_S, LONGEST_S = 60.0, 0.1, 86400.0
 # Memory of a process without a model, and memory that onnxruntime needs per byte of a model.
@@ -97,24 +98,25 @@ def verify_bundle(
             "timeout_s": timeout_s,
             "public_key": None if public_key is None else str(public_key),
         }
-        try:
-            process = subprocess.Popen(  # noqa: S603 - this very interpreter, no shell
-                # -P: do not import modules from the current folder.
-                [sys.executable, "-P", "-c", _CHILD, str(sender), json.dumps(order)],
-                stdin=subprocess.DEVNULL,
-                # The engine may print to stdout and stderr.
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                pass_fds=(sender,),
-            )
-        except OSError as error:
-            raise ModelError(
-                f"{folder}: cannot start a process for the self-test: {error.strerror}"
-            ) from None
-        finally:
-            os.close(sender)
-        stack.callback(process.wait)
-        stack.callback(process.kill)
+        with signals_deferred():
+            try:
+                process = subprocess.Popen(  # noqa: S603 - this very interpreter, no shell
+                    # -P: do not import modules from the current folder.
+                    [sys.executable, "-P", "-c", _CHILD, str(sender), json.dumps(order)],
+                    stdin=subprocess.DEVNULL,
+                    # The engine may print to stdout and stderr.
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    pass_fds=(sender,),
+                )
+            except OSError as error:
+                raise ModelError(
+                    f"{folder}: cannot start a process for the self-test: {error.strerror}"
+                ) from None
+            finally:
+                os.close(sender)
+            stack.callback(process.wait)
+            stack.callback(process.kill)
         try:
             code = process.wait(timeout_s)
         except subprocess.TimeoutExpired:

@@ -164,6 +164,26 @@ def test_modules_in_the_current_folder_are_not_taken(bundle_dir, tmp_path, monke
     assert verify_bundle(bundle_dir, threads=1).tolerance > 0
 
 
+def test_a_signal_while_the_process_starts_leaves_none_behind(with_model, bundle, tmp_path):
+    folder = with_model(endless(bundle))
+    started = tmp_path / "started"
+    interrupted = f"""
+import os, signal, subprocess
+start = subprocess.Popen._execute_child
+
+def start_and_signal(self, *rest):
+    start(self, *rest)
+    open({str(started)!r}, "w").write(str(self.pid))
+    os.kill(os.getpid(), signal.SIGTERM)
+
+subprocess.Popen._execute_child = start_and_signal
+"""
+    command = [sys.executable, "-P", "-c", interrupted + RUN, "verify", folder]
+    assert subprocess.run(command, check=False).returncode == 143
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(started.read_text()), 0)
+
+
 def test_a_terminated_verify_leaves_no_process_behind(with_model, bundle):
     folder = with_model(endless(bundle))
     process = subprocess.Popen([sys.executable, "-P", "-c", RUN, "verify", folder])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from cvo_export.datasets import synthetic
 from cvo_export.networks.backbone import BackboneConfig
 from cvo_export.networks.heads.cjp import CjpConfig
 from cvo_export.publish import publish
+from cvo_export.training import features
 from cvo_export.training.loop import train
 from cvo_export.training.run import Run, TrainConfig
 
@@ -44,6 +46,23 @@ def tiny_config(**changes: Any) -> TrainConfig:
 
 def ignore_progress(stage: str, done: int, total: int, note: str = "") -> None:
     """Discard progress reports."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _backbones_exported_once() -> Iterator[None]:
+    """Export each frozen backbone once: most runs here have the same random weights."""
+    export, graphs = features.export_onnx, {}
+
+    def export_once(module: Any, *rest: Any) -> bytes:
+        state = [(name, values.numpy().tobytes()) for name, values in module.state_dict().items()]
+        key = hashlib.sha256(repr((type(module), state, rest)).encode()).hexdigest()
+        if key not in graphs:
+            graphs[key] = export(module, *rest)
+        return graphs[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(features, "export_onnx", export_once)
+        yield
 
 
 _PICTURES: dict[Any, Any] = {}

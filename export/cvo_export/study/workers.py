@@ -12,6 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
 from cvo_edge.errors import CvoError, SinkError
+from cvo_edge.process import signals_deferred
 
 Task = Callable[[], None]
 # Receives the name of a finished task, and its error if it failed.
@@ -51,9 +52,10 @@ def _in_processes(tasks: Mapping[str, Task], jobs: int, ended: Ended) -> None:
                 name, task = waiting.pop(0)
                 receiver, sender = context.Pipe(duplex=False)
                 process = context.Process(target=_worker, args=(sender, task), daemon=True)
-                with _interrupts_ignored():
-                    process.start()
-                running[receiver] = (name, process)
+                with signals_deferred():
+                    with _interrupts_ignored():
+                        process.start()
+                    running[receiver] = (name, process)
                 # Only the process holds the sending end now, so that its death closes the pipe.
                 sender.close()
             ready = wait(list(running))
