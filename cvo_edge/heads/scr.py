@@ -1,10 +1,10 @@
 """Scene coordinate regression (SCR): the network predicts points, a solver finds the pose.
 
-The model gives for each cell of the image the world point X_i that the cell shows, and the scale
-s_i (pixels of the model's input) of that point's reprojection error (Shotton et al. 2013; Brachmann
-and Rother 2021). ``cvo_edge.pose_solver`` finds the pose and, from the curvature of the likelihood,
-a covariance C = L L^T of the six errors e = (t - t_hat, Log(R_hat^T R)). The nonconformity scores
-are
+The model gives for each cell of the image the world point X_i that the cell shows, and log s_i, the
+scale of that point's reprojection error in pixels of the model's input (Shotton et al. 2013;
+Brachmann and Rother 2021). ``cvo_edge.pose_solver`` finds the pose and, from the curvature of the
+likelihood, a covariance C = L L^T of the six errors e = (t - t_hat, Log(R_hat^T R)). The
+nonconformity scores are
 
     marginal  |e_d| / max(sqrt(C_dd), floor_d)      joint  |L'^-1 e|
 
@@ -97,7 +97,7 @@ class ScrHead(Head):
     def __init__(self, parameters: ScrParameters, score: str) -> None:
         super().__init__(parameters, score)
         rows, columns = parameters.grid
-        self.outputs = {"coordinates": (1, rows * columns, 3), "scale_px": (1, rows * columns)}
+        self.outputs = {"coordinates": (1, rows * columns, 3), "log_scale_px": (1, rows * columns)}
         self._floor = np.array(parameters.deviation_floor)
 
     def check(self, thresholds: Sequence[Threshold], joint: Joint) -> None:
@@ -128,7 +128,7 @@ class ScrHead(Head):
         count = min(BEST_CELLS, len(rays))
 
         def solve(outputs: Mapping[str, NDArray[Any]]) -> Solved:
-            scale_px = outputs["scale_px"][0].astype(np.float64)
+            scale_px = np.exp(outputs["log_scale_px"][0].astype(np.float64))
             found = pose_solver.solve(outputs["coordinates"][0], scale_px / seen.focal_px)
             best = np.argpartition(scale_px, count - 1)[:count]
             squared = found.squared[best]

@@ -56,7 +56,7 @@ def outputs_of(camera, pose, generator, noise_px=0.5):
     world = points @ geometry.quaternion_to_matrix(pose[3:]).T + pose[:3]
     return {
         "coordinates": world[np.newaxis].astype(np.float32),
-        "scale_px": np.full((1, len(rays)), noise_px, np.float32),
+        "log_scale_px": np.full((1, len(rays)), np.log(noise_px), np.float32),
     }
 
 
@@ -98,8 +98,9 @@ def test_points_of_no_place_are_doubted():
     solve = ScrHead(PARAMETERS, "normalised").solver(CAMERA, INPUTS)
     for scale in (0.3, 3.0, 30.0):
         points = generator.normal(0.0, 2.0, (1, 192, 3)).astype(np.float32)
-        scales = np.full((1, 192), scale, np.float32)
-        assert solve({"coordinates": points, "scale_px": scales}).doubt is Reason.IMAGE_UNFAMILIAR
+        logs = np.full((1, 192), np.log(scale), np.float32)
+        found = solve({"coordinates": points, "log_scale_px": logs})
+        assert found.doubt is Reason.IMAGE_UNFAMILIAR
 
 
 def test_without_intrinsics_it_is_refused():

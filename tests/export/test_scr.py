@@ -94,12 +94,22 @@ def test_an_interrupted_run_ends_as_if_it_never_was(runs, stage, tmp_path):
     assert run.history == resumed.history
 
 
-@pytest.mark.parametrize("method", list(CONFIGS))
-def test_a_bundle_locates_the_camera_and_covers_it(runs, method):
-    _, run, bundle = runs(method)
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """A run that learned its place, unlike the others, which only pass through every step."""
+    folder = tmp_path_factory.mktemp("learned") / "fused"
+    head = FusedConfig(width=64, blocks=1, cell_steps=1500)
+    run = train(folder, config("fused", head=head, steps=400, averaging=0.98), ignore_progress)
+    bundle = folder.with_name("bundle")
+    publish(run, bundle, "learned")
+    return run, bundle
+
+
+def test_a_bundle_locates_the_camera_and_covers_it(learned):
+    run, bundle = learned
     report = evaluate(bundle, run.dataset, "test")
     spread = float(np.linalg.norm(run.dataset.poses[:, :3].std(axis=0)))
-    assert report["point_error"]["median_m"] < 0.5 * spread
+    assert report["point_error"]["median_m"] < 0.3 * spread
     assert report["frames"]["invalid"] == 0
     for scope in ("marginal", "joint"):
         level = find_level(report["levels"], 0.9, scope)
@@ -120,11 +130,11 @@ def test_the_runtime_solves_for_the_pose_of_torchs_coordinates(runs):
         with torch.no_grad():
             coordinates, scale = run.graph(torch.from_numpy(image))
         np.testing.assert_allclose(seen.outputs["coordinates"][row], coordinates[0], atol=1e-4)
-        np.testing.assert_allclose(seen.outputs["scale_px"][row], scale[0], rtol=1e-3)
+        np.testing.assert_allclose(seen.outputs["log_scale_px"][row], scale[0], atol=1e-4)
 
 
-def test_another_room_gets_no_interval(runs):
-    _, _, bundle = runs("scr")
+def test_another_room_gets_no_interval(learned):
+    _, bundle = learned
     generator = np.random.default_rng(0)
     with Odometer.load(bundle) as odometer:
         for _ in range(10):

@@ -62,7 +62,7 @@ class Pooled(nn.Module):
 class FusedHead(ExportedHead):
     """Map of the stem -> the outputs of SCR, regression (n, 7) and half_width (n, 6)."""
 
-    output_names = ("coordinates", "scale_px", "regression", "half_width")
+    output_names = ("coordinates", "log_scale_px", "regression", "half_width")
     runtime_method = "fused"
     rotation = "tangent_predicted"
 
@@ -77,7 +77,7 @@ class FusedHead(ExportedHead):
         self.focal_px: Tensor
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return coordinates, scales, regressed pose and half-widths, m and rad."""
+        """Return coordinates, log scales, regressed pose and half-widths, m and rad."""
         upper = self.scr.upper
         deep = upper.deep(features)
         points, log_scale = self.scr.network(upper.cells(features, deep))
@@ -85,7 +85,7 @@ class FusedHead(ExportedHead):
             self.decoder(values) for values in self.regression(self.pooled(deep))
         )
         half_width = 0.5 * (upper_bound - lower)
-        return points, torch.exp(log_scale), self.decoder.pose(point), half_width
+        return points, log_scale, self.decoder.pose(point), half_width
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Return the only score."""

@@ -236,9 +236,9 @@ class _FrameLearner(_CellLearner):
 
 
 class ScrHead(ExportedHead):
-    """Map of the stem -> coordinates (n, cells, 3), m, and scale_px (n, cells)."""
+    """Map of the stem -> coordinates (n, cells, 3), m, and log_scale_px (n, cells)."""
 
-    output_names = ("coordinates", "scale_px")
+    output_names = ("coordinates", "log_scale_px")
     runtime_method = "scr"
     rotation = "tangent_predicted"
 
@@ -251,9 +251,9 @@ class ScrHead(ExportedHead):
         self.deviation: Tensor
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return coordinates and scales."""
+        """Return coordinates and the logarithms of their scales."""
         points, log_scale = self.network(self.upper(features))
-        return points, torch.exp(log_scale)
+        return points, log_scale
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Return the only score."""
