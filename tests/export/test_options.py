@@ -87,7 +87,7 @@ def test_one_name_has_one_type():
 def test_a_shared_option_names_its_methods_and_their_defaults():
     text = text_of(run("train", "--help"))
     assert "(>= 0; cjp: 0.001; mcqr: 0.01)" in text
-    assert "(all methods: 256 128)" in text
+    assert "Widths of the two hidden layers. (cjp, cqr, csp, mcqr, " in text
     assert "Gaussians in the mixture of each degree of freedom. (>= 1, <= 64; mdn: 3)" in text
 
 
