@@ -160,7 +160,8 @@ def table(report: Mapping[str, Any]) -> list[str]:
         f"calibrated on "
         f"{report['n_calibration']}",
         f"point error  median {100 * error['median_m']:.2f} cm {error['median_deg']:.2f} deg, "
-        f"90 % {100 * error['p90_m']:.2f} cm {error['p90_deg']:.2f} deg",
+        f"90 % {100 * error['p90_m']:.2f} cm {error['p90_deg']:.2f} deg, "
+        f"99 % {100 * error['p99_m']:.2f} cm {error['p99_deg']:.2f} deg",
     ]
     if report["noise"] is not None:
         noise = Noise(report["noise"]["name"], report["noise"]["strength"])

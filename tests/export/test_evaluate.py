@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from itertools import product
 
 import numpy as np
 import pytest
@@ -28,7 +29,8 @@ def test_report_has_the_documented_keys(report):
     for key in ("method", "dataset", "subset", "frames", "point_error", "levels", "sequences"):
         assert key in report
     assert set(report["frames"]) == {"total", "bounded", "degraded", "invalid"}
-    assert set(report["point_error"]) == {"median_m", "median_deg", "p90_m", "p90_deg"}
+    kinds = product(("median", "p90", "p99"), ("m", "deg"))
+    assert set(report["point_error"]) == {f"{name}_{unit}" for name, unit in kinds}
     assert len(report["levels"]) == 10
     for level in report["levels"]:
         for key in (

@@ -31,7 +31,7 @@ _LARGEST_LOG = 700.0
 
 
 def point_error(seen: Observed) -> dict[str, float]:
-    """Return the median and the 90 % quantile of the position (m) and rotation (deg) errors."""
+    """Return the median and two quantiles of the position (m) and rotation (deg) errors."""
     distance = np.linalg.norm(seen.pose[:, :3] - seen.true_pose[:, :3], axis=1)
     difference = geometry.quaternion_multiply(
         geometry.quaternion_conjugate(seen.pose[:, 3:]), seen.true_pose[:, 3:]
@@ -41,7 +41,9 @@ def point_error(seen: Observed) -> dict[str, float]:
         "median_m": float(np.median(distance)),
         "median_deg": float(np.median(angle)),
         "p90_m": float(np.quantile(distance, 0.9)),
+        "p99_m": float(np.quantile(distance, 0.99)),
         "p90_deg": float(np.quantile(angle, 0.9)),
+        "p99_deg": float(np.quantile(angle, 0.99)),
     }
 
 

@@ -140,7 +140,7 @@ METHOD = Method(
     _train,
     _restore,
     cells=True,
-    copies=2 * SCR.copies,
+    copies=SCR.copies,
     steps=SCR.steps,
     augment=SCR.augment,
 )
