@@ -46,7 +46,7 @@ class Reason(StrEnum):
     IMAGE_SATURATED = "image_saturated"  # degraded: more than half of the image is white
     IMAGE_FLAT = "image_flat"  # degraded: one colour, no contrast
     IMAGE_SIZE_CHANGED = "image_size_changed"  # degraded: not the size of the stream's first frame
-    CAMERA_DIFFERS = "camera_differs"  # degraded: the image's shape is not that of the known camera
+    CAMERA_DIFFERS = "camera_differs"  # degraded: the images are not those of the stated camera
     IMAGE_UNFAMILIAR = "image_unfamiliar"  # degraded: does not show the place the network knows
     FRAME_REPEATED = "frame_repeated"  # degraded: the same image came before; it may be frozen
     FRAME_STALE = "frame_stale"  # degraded: the frame waited for more than a second

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Threshold
 from cvo_edge.camera import Camera
+from cvo_edge.camera_check import LensEstimate
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.engine.observation import Observation, Observer
@@ -121,6 +122,7 @@ class Odometer:
         )
         self.chart = self._observer.chart
         self._stream_checks = StreamChecks()
+        self._camera_check = self._observer.camera_check()
         self._clock = SYSTEM_CLOCK
         self._stepping = Lock()
         self._seq = 0
@@ -260,6 +262,7 @@ class Odometer:
                 "odometer.stream(open_source(path))"
             )
         self._stream_checks = StreamChecks()
+        self._camera_check = self._observer.camera_check()
         with closing(
             run_stream(
                 frames, self.mode, self._workers, self._process, lambda: self._seq, self._clock
@@ -292,6 +295,8 @@ class Odometer:
         # The age counts until the estimate is given: a process may be stopped at any point.
         age_ms = frame.age_ms(self._clock.now_s())
         doubts += self._stream_checks.doubts(observation.look, frame.stamp_ns, age_ms)
+        if self._camera_differs(observation) and Reason.CAMERA_DIFFERS not in doubts:
+            doubts += (Reason.CAMERA_DIFFERS,)
         if doubts:
             found = unbounded_set()
         return PoseInterval(
@@ -313,6 +318,23 @@ class Odometer:
                 "total": round(processed.total_ms, 4),
             },
         )
+
+    def _camera_differs(self, observation: Observation) -> bool:
+        """Pass a frame to the camera check, unless something else is wrong with its image."""
+        if self._camera_check is None or observation.fault is not None:
+            return False
+        if observation.doubt not in (None, Reason.IMAGE_UNFAMILIAR):
+            return False
+        familiar = observation.doubt is None
+        return self._camera_check.differs(observation.outputs, familiar=familiar)
+
+    @property
+    def seen_camera(self) -> LensEstimate | None:
+        """The camera that the frames of the stream show, relative to the stated one.
+
+        None if the method cannot tell, or for fewer than 30 frames of the known place.
+        """
+        return None if self._camera_check is None else self._camera_check.estimate()
 
     def _remarks(self, observation: Observation, found: ConformalSet) -> tuple[Reason, ...]:
         remarks: tuple[Reason, ...] = ()

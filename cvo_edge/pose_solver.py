@@ -16,6 +16,7 @@ inliers and poses centimetres away, so two processors would disagree.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +32,8 @@ NU = 3.0
 # cells contradict each other.
 _SMOOTHING = (1000.0, 100.0, 10.0, 3.0, 1.0)
 _NEWTON_STEPS = 4
-# Steps of the camera's fit, and precision of the prior on its three parameters.
-_LENS_STEPS, _LENS_PRECISION = 4, 1.0
+# Steps of a camera's fit, and precision of the prior on its three numbers.
+_LENS_STEPS, _LENS_PRECISION = 10, 1.0
 # Points closer to the image plane than this share of the damping deviation of the position, or
 # behind it, have no weight.
 _NEAR = 0.01
@@ -155,68 +156,122 @@ class PoseSolver:
         np.negative(u, out=J[5, 1])
         return image, J, ahead
 
-    def camera_fit(self, points: Array, scale: Array, pose: Array) -> CameraFit:
-        """Return the focal lengths and distortion that fit a solved frame best.
+    def lens_evidence(self, points: Array, scale: Array, pose: Array) -> LensEvidence:
+        """Return what a solved frame says about the camera; arguments as for ``solve``.
 
-        The image of a ray (u, v) becomes (1 + k r^2) (e^a u, e^b v), with r^2 = u^2 + v^2; the six
-        degrees of freedom of the pose and a, b, k take reweighted Gauss-Newton steps together.
+        The image of a ray (u, v) becomes (1 + k r^2) (e^a u, e^b v), with r^2 = u^2 + v^2. Of the
+        second derivatives by the pose and (a, b, k) together, the Schur complement is what remains
+        for (a, b, k) once the pose has adapted.
+        """
+        R = geometry.quaternion_to_matrix(pose[3:])
+        hessian, gradient = self._lens_system(points, scale, R, pose[:3], np.zeros(3), newton=True)
+        by_pose = np.linalg.solve(hessian[:6, :6], hessian[:6, 6:]).T
+        return LensEvidence(
+            by_pose @ gradient[:6] - gradient[6:], hessian[6:, 6:] - by_pose @ hessian[:6, 6:]
+        )
+
+    def lens_fit(self, frames: Sequence[tuple[Array, Array, Array]]) -> LensFit:
+        """Fit one camera to several frames, given as (points, scale, pose) each.
+
+        All poses and the three numbers of ``lens_evidence`` take reweighted Gauss-Newton steps
+        together, as in a bundle adjustment whose points stay fixed.
+        """
+        R = [geometry.quaternion_to_matrix(pose[3:]) for _, _, pose in frames]
+        t = [pose[:3] for _, _, pose in frames]
+        lens = np.zeros(3)
+        for _ in range(_LENS_STEPS):
+            information, pull = np.diag(np.full(3, _LENS_PRECISION)), _LENS_PRECISION * lens
+            systems = []
+            for (points, scale, _), R_i, t_i in zip(frames, R, t, strict=True):
+                hessian, gradient = self._lens_system(points, scale, R_i, t_i, lens, newton=False)
+                solved = np.linalg.solve(hessian[:6, :6], np.c_[hessian[:6, 6:], gradient[:6]])
+                information = information + hessian[6:, 6:] - hessian[6:, :6] @ solved[:, :3]
+                pull = pull + gradient[6:] - hessian[6:, :6] @ solved[:, 3]
+                systems.append(solved)
+            step = np.linalg.solve(information, pull)
+            lens = lens - step
+            for number, solved in enumerate(systems):
+                move = np.asarray(solved[:, 3] - solved[:, :3] @ step)
+                R[number], t[number] = _moved(R[number], t[number], move)
+        errors = [
+            np.linalg.norm(
+                _distorted(self._projected(R_i, t_i, points.T)[0], lens) - self._rays, axis=0
+            )
+            for (points, _, _), R_i, t_i in zip(frames, R, t, strict=True)
+        ]
+        return LensFit(lens, np.array(errors))
+
+    def _lens_system(
+        self, points: Array, scale: Array, R: Array, t: Array, lens: Array, newton: bool
+    ) -> tuple[Array, Array]:
+        """Return the second (9, 9) and first (9,) derivatives of one frame's loss.
+
+        The nine are the pose, as in ``_projected``, and the lens (a, b, k).
         """
         X = np.ascontiguousarray(points.T, dtype=np.float64)
         spread = NU * np.square(scale, dtype=np.float64)
-        if self._seen is not None:
-            spread = np.where(self._seen, spread, np.inf)
-        R, t = geometry.quaternion_to_matrix(pose[3:]), pose[:3]
-        lens = np.zeros(3)
-        precision = np.concatenate([self._precision, np.full(3, _LENS_PRECISION)])
-        first = last = 0.0
-        for number in range(_LENS_STEPS + 1):
-            image, J, ahead = self._projected(R, t, X)
-            zoom, r2 = np.exp(lens[:2])[:, np.newaxis], (image * image).sum(axis=0)
-            radial = 1.0 + lens[2] * r2
-            shown = zoom * radial * image
-            error = shown - self._rays
-            squared = (error * error).sum(axis=0)
-            last = 0.5 * (NU + 2.0) * float((np.log1p(squared / spread) * ahead).sum())
-            first = first if number else last
-            if number == _LENS_STEPS:
-                break
-            # d shown = zoom (radial d image + 2 k image (image . d image)).
-            along = (J * image).sum(axis=1)
-            J = zoom * (radial * J + 2.0 * lens[2] * image * along[:, np.newaxis])
-            by_lens = np.zeros((3, 2, X.shape[1]))
-            by_lens[0, 0], by_lens[1, 1], by_lens[2] = shown[0], shown[1], zoom * r2 * image
-            full = np.concatenate([J, by_lens])
-            weighted = full * ((NU + 2.0) / (spread + squared) * ahead)
-            rows = weighted.reshape(9, -1)
-            information = rows @ full.reshape(9, -1).T
-            information.flat[::10] += precision
-            gradient = rows @ error.reshape(-1)
-            gradient[6:] += _LENS_PRECISION * lens
-            step = np.linalg.solve(information, gradient)
-            R, t = _moved(R, t, step)
-            lens = lens - step[6:]
-            # Schur complement: what is left for the camera once the pose has adapted.
-            by_pose = np.linalg.solve(information[:6, :6], information[:6, 6:])
-            lens_information = information[6:, 6:] - information[6:, :6] @ by_pose
-        return CameraFit(lens, lens_information, first - last)
+        image, J, ahead = self._projected(R, t, X)
+        zoom, r2 = np.exp(lens[:2])[:, np.newaxis], image[0] * image[0] + image[1] * image[1]
+        shown = _distorted(image, lens)
+        full = np.zeros((9, *image.shape))
+        full[:6] = J
+        if lens.any():
+            # d shown = zoom ((1 + k r^2) d image + 2 k image (image . d image)).
+            along = (J * image).sum(axis=1)[:, np.newaxis]
+            full[:6] = zoom * ((1.0 + lens[2] * r2) * J + 2.0 * lens[2] * image * along)
+        full[6, 0], full[7, 1], full[8] = shown[0], shown[1], zoom * r2 * image
+        error = shown - self._rays
+        squared = error[0] * error[0] + error[1] * error[1]
+        weight = (NU + 2.0) / (spread + squared)
+        weight *= ahead if self._seen is None else ahead & self._seen
+        weighted = full * weight
+        rows = weighted.reshape(9, -1)
+        hessian = rows @ full.reshape(9, -1).T
+        if newton:
+            pull = weighted[:, 0] * error[0] + weighted[:, 1] * error[1]
+            hessian -= (2.0 / (NU + 2.0)) * (pull @ pull.T)
+        hessian.flat[: 6 * 9 : 10] += self._precision
+        return hessian, rows @ error.reshape(-1)
 
 
-class CameraFit(NamedTuple):
-    """How a camera seems to differ from the stated one, by one frame.
+class LensEvidence(NamedTuple):
+    """How the camera seems to differ from the stated one, by one frame.
+
+    The evidence of several frames adds up; ``information^-1 gradient`` is then a first estimate of
+    three numbers: the logarithms of the factors of fx and fy, and the additional radial distortion
+    k1. A single frame may leave some of them open.
+
+    Attributes
+    ----------
+    gradient
+        Shape (3,): derivative of the log likelihood.
+    information
+        Shape (3, 3): its negative second derivative, with the pose free to adapt.
+    """
+
+    gradient: Array
+    information: Array
+
+
+class LensFit(NamedTuple):
+    """The camera that fits several frames best.
 
     Attributes
     ----------
     lens
-        Shape (3,): logarithms of the factors of fx and fy, and additional radial distortion k1.
-    information
-        Shape (3, 3): inverse covariance of these three.
-    gain
-        By how much the log likelihood grows if the camera differs so.
+        Shape (3,): the three numbers of ``LensEvidence``.
+    error
+        Shape (frames, n): reprojection errors that remain, in normalised coordinates.
     """
 
     lens: Array
-    information: Array
-    gain: float
+    error: Array
+
+
+def _distorted(image: Array, lens: Array) -> Array:
+    """Image coordinates (2, n) as a camera that differs by ``lens`` (3,) would show them."""
+    r2 = image[0] * image[0] + image[1] * image[1]
+    return np.asarray(np.exp(lens[:2])[:, np.newaxis] * (1.0 + lens[2] * r2) * image)
 
 
 def _moved(R: Array, t: Array, step: Array) -> tuple[Array, Array]:

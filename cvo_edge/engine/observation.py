@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import MAX_NUMBER, ModelSpec, PoseSpec, PreprocessSpec
 from cvo_edge.camera import Camera
+from cvo_edge.camera_check import CameraCheck
 from cvo_edge.engine.loading import open_session
 from cvo_edge.engine.model_cache import CachedModel
 from cvo_edge.engine.session import Session
@@ -106,6 +107,7 @@ class Observer:
             model, threads, spec, spinning=spinning, at_once=at_once
         )
         self._inputs = inputs
+        self._camera = camera
         self._head = head
         self._solver = head.solver(camera, inputs)
         # Only a solver depends on the camera's shape.
@@ -181,6 +183,10 @@ class Observer:
         pose, point, fault = self._checked(outputs, fault)
         spent_ms = 1e3 * (ready - start), 1e3 * (done - ready)
         return Observation(outputs, pose, point, fault, doubt, look, *spent_ms)
+
+    def camera_check(self) -> CameraCheck | None:
+        """Return a check of the camera for a new stream, or None if the method has none."""
+        return self._head.camera_check(self._camera, self._inputs)
 
     def _checked(
         self, outputs: Mapping[str, NDArray[Any]], fault: Reason | None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import PreprocessSpec, Threshold
 from cvo_edge.camera import Camera
+from cvo_edge.camera_check import CameraCheck
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.estimate import Reason
@@ -104,6 +105,10 @@ class Head(ABC):
         """
         return None
 
+    def camera_check(self, camera: Camera | None, inputs: PreprocessSpec) -> CameraCheck | None:
+        """Return the check of a stream's camera; None by default. Arguments as for ``solver``."""
+        return None
+
     def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
         """Return the marginal confidence of each side's threshold; None for an unbounded side."""
         return (confidence,)
@@ -136,6 +141,7 @@ class Head(ABC):
         val: Mapping[str, NDArray[Any]],
         poses: Array,
         known: Mapping[str, NDArray[Any]],
+        sequence: NDArray[np.int64],
     ) -> Struct:
         """Return the parameters with what frames of the known place decide; by default unchanged.
 
@@ -143,9 +149,10 @@ class Head(ABC):
         ----------
         val, poses
             Outputs of n val frames, stacked, and their true poses (n, 7): for choices.
-        known
-            Outputs of all val and cal frames: for limits, which must accept all of them, so that
-            none is left out of the calibration.
+        known, sequence
+            Outputs of all val and cal frames in the order of the data set, and the numbers of the
+            sequences they belong to: for limits. Frames beyond them are left out of the
+            calibration, as they get no interval at run time.
         """
         parameters: Struct = self.parameters
         return parameters

@@ -76,8 +76,8 @@ class FusedHead(ScrHead):
     def combined(
         self, outputs: Mapping[str, NDArray[Any]], found: Solution, focal_px: float
     ) -> tuple[Array, Array, dict[str, Array]]:
-        """As ``ScrHead``: the fused pose; adds ``solved_pose`` (1, 7) and ``solved`` (1, 6, 6)."""
-        added = {"solved_pose": found.pose[np.newaxis], "solved": found.information[np.newaxis]}
+        """As ``ScrHead``: the fused pose; adds the solver's information ``solved`` (1, 6, 6)."""
+        added = {"solved": found.information[np.newaxis]}
         fusion, own = self.parameters.fusion, self.parameters.focal_px
         if fusion is None or fusion.share == 0.0 or abs(focal_px / own - 1.0) > _SAME_FOCAL:
             return found.pose, found.information, added
@@ -93,9 +93,11 @@ class FusedHead(ScrHead):
         val: Mapping[str, NDArray[Any]],
         poses: Array,
         known: Mapping[str, NDArray[Any]],
+        sequence: NDArray[np.int64],
     ) -> FusedParameters:
         """As ``ScrHead``, and the weights with the best interval score on val."""
-        limits = super().tuned(val, poses, known).limits
+        limited = super().tuned(val, poses, known, sequence)
+        limits, camera_limits = limited.limits, limited.camera_limits
         regression = np.asarray(val["regression"], np.float64)
         regression[:, 3:] = geometry.quaternion_normalise(regression[:, 3:])
         solved, half_width = val["solved_pose"], np.asarray(val["half_width"], np.float64)
@@ -109,11 +111,13 @@ class FusedHead(ScrHead):
             _score(poses, solved, val["solved"], regression, half_width, fusion)
             for fusion in choices
         ]
-        return replace(self.parameters, limits=limits, fusion=choices[int(np.argmin(scores))])
+        fusion = choices[int(np.argmin(scores))]
+        return replace(self.parameters, limits=limits, camera_limits=camera_limits, fusion=fusion)
 
     def candidates(self) -> tuple[Candidate, ...]:
         """As ``ScrHead``; other data need other weights."""
-        return (Candidate(self.score, replace(self.parameters, limits=None, fusion=None)),)
+        parameters = replace(self.parameters, limits=None, camera_limits=None, fusion=None)
+        return (Candidate(self.score, parameters),)
 
 
 def fused(

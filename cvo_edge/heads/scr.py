@@ -12,7 +12,8 @@ where L' is L with its rows enlarged by the same floors. The marginal set is an 
 solved pose; the joint set is an ellipsoid. Frames that agree on a pose get narrow sets.
 
 A frame also tells how far it can be trusted: in a place the network does not know, the cells are
-vague, or disagree on the pose. ``Signs`` holds the limits, from frames of the known place.
+vague, or disagree on the pose. ``Signs`` holds the limits, from frames of the known place. Over a
+stream, the frames also show whether the camera is the stated one (``cvo_edge.camera_check``).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Number, Positive, PreprocessSpec, SixPositive, Threshold
 from cvo_edge.camera import Camera, cell_centres
+from cvo_edge.camera_check import CameraCheck, LensLimits, fitted_limits
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.estimate import Reason
@@ -52,6 +54,12 @@ _HAIR = 1e-12
 # same place has frames that are a little harder.
 _MARGIN_ERROR, _MARGIN_CONTRADICTING = 1.3, 0.05
 _LEAST_ERROR_PX = 0.1
+# Where most of the best cells contradict the pose, a frame is lost, even if it was calibrated on:
+# frames between the trained ones may show parts of the place that no trained frame shows.
+_LOST = 0.5
+# Share of new recordings of the known camera that may seem to differ, and the margin for data sets
+# with too few recordings to tell.
+_CAMERA_SHARE, _CAMERA_MARGIN = 0.05, 1.5
 
 
 class Signs(Struct, frozen=True, forbid_unknown_fields=True):
@@ -73,7 +81,8 @@ class ScrParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     ``grid``: rows and columns of cells. ``starts``: poses tx ty tz qx qy qz qw from which the
     solver starts. ``damping``: deviation per DoF (m, rad) that damps its steps.
     ``deviation_floor``: smallest deviation per DoF (m, rad) in the scores. ``limits``: frames
-    beyond them get no interval; null accepts every frame.
+    beyond them get no interval; null accepts every frame whose solver converges.
+    ``camera_limits``: streams beyond them get no interval; null does not check the camera.
     """
 
     grid: tuple[Annotated[int, Meta(ge=1, le=1024)], Annotated[int, Meta(ge=1, le=1024)]]
@@ -81,6 +90,7 @@ class ScrParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     damping: SixPositive
     deviation_floor: SixPositive
     limits: Signs | None
+    camera_limits: LensLimits | None
 
 
 class ScrHead(Head):
@@ -117,39 +127,60 @@ class ScrHead(Head):
                 )
 
     def solver(self, camera: Camera | None, inputs: PreprocessSpec) -> Solver | None:
-        """As ``Head``: adds ``pose`` (1, 7), ``scale`` (1, 6, 6) and ``signs`` (1, 2)."""
-        if camera is None:
-            raise CalibrationFileError("camera: expected intrinsics for scr, found null")
-        seen = input_camera(camera, inputs.height, inputs.width, inputs.crop)
-        rays = seen.rays(cell_centres(inputs.height, inputs.width, self.parameters.grid))
-        damping = np.array(self.parameters.damping)
-        pose_solver = PoseSolver(rays, np.array(self.parameters.starts), damping)
+        """As ``Head``: adds ``pose`` (1, 7), ``scale`` (1, 6, 6), ``signs`` (1, 2) and the rest.
+
+        ``solved_pose`` (1, 7) is the solver's, which fusion may change; ``lens_gradient`` (1, 3)
+        and ``lens_information`` (1, 3, 3) are evidence for the camera check.
+        """
+        pose_solver, focal_px = self._pose_solver(camera, inputs)
         limits = self.parameters.limits
-        count = min(BEST_CELLS, len(rays))
+        count = min(BEST_CELLS, math.prod(self.parameters.grid))
 
         def solve(outputs: Mapping[str, NDArray[Any]]) -> Solved:
             scale_px = np.exp(outputs["log_scale_px"][0].astype(np.float64))
-            found = pose_solver.solve(outputs["coordinates"][0], scale_px / seen.focal_px)
+            points, scale = outputs["coordinates"][0], scale_px / focal_px
+            found = pose_solver.solve(points, scale)
+            lens = pose_solver.lens_evidence(points, scale, found.pose)
             best = np.argpartition(scale_px, count - 1)[:count]
             squared = found.squared[best]
             error_px = math.sqrt(np.median(squared * np.square(scale_px[best])))
             contradicting = np.count_nonzero(squared > _CONTRADICTS**2) / count
-            pose, information, added = self.combined(outputs, found, seen.focal_px)
+            pose, information, added = self.combined(outputs, found, focal_px)
             solved = {
                 **outputs,
                 **added,
                 "pose": pose[np.newaxis],
                 "scale": _lower_triangular(np.asarray(np.linalg.inv(information)))[np.newaxis],
                 "signs": np.array([[error_px, contradicting]]),
+                "solved_pose": found.pose[np.newaxis],
+                "lens_gradient": lens.gradient[np.newaxis],
+                "lens_information": lens.information[np.newaxis],
             }
-            strange = limits is not None and (
-                not found.last_step < _CONVERGED
-                or error_px > limits.error_px
-                or contradicting > limits.contradicting
+            strange = not found.last_step < _CONVERGED or (
+                limits is not None
+                and (error_px > limits.error_px or contradicting > limits.contradicting)
             )
             return Solved(solved, Reason.IMAGE_UNFAMILIAR if strange else None)
 
         return solve
+
+    def camera_check(self, camera: Camera | None, inputs: PreprocessSpec) -> CameraCheck | None:
+        """As ``Head``."""
+        limits, signs = self.parameters.camera_limits, self.parameters.limits
+        if limits is None or signs is None:
+            return None
+        return CameraCheck(*self._pose_solver(camera, inputs), limits, signs.error_px)
+
+    def _pose_solver(
+        self, camera: Camera | None, inputs: PreprocessSpec
+    ) -> tuple[PoseSolver, float]:
+        """Return the solver for a camera, and its focal length in pixels of the model's input."""
+        if camera is None:
+            raise CalibrationFileError("camera: expected intrinsics for scr, found null")
+        seen = input_camera(camera, inputs.height, inputs.width, inputs.crop)
+        rays = seen.rays(cell_centres(inputs.height, inputs.width, self.parameters.grid))
+        starts, damping = np.array(self.parameters.starts), np.array(self.parameters.damping)
+        return PoseSolver(rays, starts, damping), seen.focal_px
 
     def combined(
         self, outputs: Mapping[str, NDArray[Any]], found: Solution, focal_px: float
@@ -165,14 +196,27 @@ class ScrHead(Head):
         val: Mapping[str, NDArray[Any]],
         poses: Array,
         known: Mapping[str, NDArray[Any]],
+        sequence: NDArray[np.int64],
     ) -> ScrParameters:
-        """As ``Head``: limits of the signs, a margin beyond the largest of the known frames."""
-        error_px, contradicting = known["signs"].max(axis=0).tolist()
+        """As ``Head``: limits of the signs, a margin beyond the largest of the known frames.
+
+        Frames that are lost have no part in the limits.
+        """
+        signs = known["signs"]
+        located = signs[:, 1] <= _LOST
+        error_px, contradicting = signs[located].max(axis=0, initial=0.0).tolist()
         limits = Signs(
             max(error_px, _LEAST_ERROR_PX) * _MARGIN_ERROR,
-            min(1.0, contradicting + _MARGIN_CONTRADICTING),
+            min(_LOST, contradicting + _MARGIN_CONTRADICTING),
         )
-        return replace(self.parameters, limits=limits)
+        camera_limits = fitted_limits(
+            known["lens_gradient"][located],
+            known["lens_information"][located],
+            sequence[located],
+            _CAMERA_SHARE,
+            _CAMERA_MARGIN,
+        )
+        return replace(self.parameters, limits=limits, camera_limits=camera_limits)
 
     def joint_scale(self, scores: Array) -> JointScale:
         """As ``Head``; one distance needs no scaling."""
@@ -212,7 +256,7 @@ class ScrHead(Head):
 
     def candidates(self) -> tuple[Candidate, ...]:
         """As ``Head``; other data need other limits."""
-        return (Candidate(self.score, replace(self.parameters, limits=None)),)
+        return (Candidate(self.score, replace(self.parameters, limits=None, camera_limits=None)),)
 
     def joint_description(self, joint: Joint) -> str:
         """As ``Head``."""

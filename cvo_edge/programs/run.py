@@ -11,6 +11,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.camera_check import LensEstimate
 from cvo_edge.estimate import PoseInterval, Status
 from cvo_edge.ground_truth import GroundTruth
 from cvo_edge.input.frame import Source
@@ -27,7 +28,7 @@ class RunSummary:
     ``width_sum`` sums the widths of bounded frames, without gaps; ``disjoint`` counts frames with a
     gap in some degree of freedom; ``skipped`` counts frames dropped for a newer one; ``compared``
     counts frames with an estimated and a true pose, and ``covered`` those whose set holds the true
-    value, per degree of freedom.
+    value, per degree of freedom; ``camera`` is what the frames show of the camera, if they do.
     """
 
     dof: tuple[str, ...]
@@ -44,6 +45,7 @@ class RunSummary:
     compared: int = 0
     covered: Array = field(default_factory=lambda: np.zeros(6))
     covered_jointly: int = 0
+    camera: LensEstimate | None = None
     # Frames are numbered from 0, so that dropped frames at the start are counted, too.
     _last_seq: int = -1
 
@@ -79,6 +81,12 @@ class RunSummary:
         if self.reasons:
             found = ", ".join(f"{name} {count}" for name, count in sorted(self.reasons.items()))
             lines.append(f"remarks     {found}")
+        if self.camera is not None:
+            fx, fy, k1, frames = self.camera
+            lines.append(
+                f"camera      by {frames} frames: fx {fx:.3f} x and fy {fy:.3f} x the stated, "
+                f"k1 {k1:+.3f}"
+            )
         latency = self.latency.summary()
         if latency:
             total, model = latency["total"], latency["model"]
@@ -122,9 +130,12 @@ def run(
     The caller owns the summary and can show it even if the source ends early. ``tick`` is called
     after each frame.
     """
-    with closing(odometer.stream(frames)) as estimates:
-        for estimate in islice(estimates, max_frames):
-            write(estimate)
-            summary.add(estimate, truth.pose_of(estimate) if truth else None)
-            if tick is not None:
-                tick()
+    try:
+        with closing(odometer.stream(frames)) as estimates:
+            for estimate in islice(estimates, max_frames):
+                write(estimate)
+                summary.add(estimate, truth.pose_of(estimate) if truth else None)
+                if tick is not None:
+                    tick()
+    finally:
+        summary.camera = odometer.seen_camera

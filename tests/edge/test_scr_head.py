@@ -37,6 +37,7 @@ PARAMETERS = ScrParameters(
     damping=(1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
     deviation_floor=(1e-4,) * 6,
     limits=Signs(error_px=4.0, contradicting=0.3),
+    camera_limits=None,
 )
 CHART = Chart("tangent_predicted")
 
@@ -108,13 +109,17 @@ def test_without_intrinsics_it_is_refused():
         ScrHead(PARAMETERS, "normalised").solver(None, INPUTS)
 
 
+def stacked(frames):
+    return {name: np.concatenate([each[name] for each in frames]) for name in frames[0]}
+
+
 def test_limits_accept_every_known_frame():
     generator = np.random.default_rng(0)
     head = ScrHead(msgspec.structs.replace(PARAMETERS, limits=None), "normalised")
     solve = head.solver(CAMERA, INPUTS)
     frames = [outputs_of(CAMERA, pose_near(generator), generator) for _ in range(50)]
-    known = {"signs": np.concatenate([solve(frame).outputs["signs"] for frame in frames])}
-    tuned = ScrHead(head.tuned(known, np.empty((0, 7)), known), "normalised")
+    known = stacked([solve(frame).outputs for frame in frames])
+    tuned = ScrHead(head.tuned(known, np.empty((0, 7)), known, np.zeros(50, int)), "normalised")
     again = tuned.solver(CAMERA, INPUTS)
     assert all(again(frame).doubt is None for frame in frames)
     assert tuned.candidates()[0].parameters.limits is None
@@ -165,8 +170,7 @@ def fused_frames(generator, count, deviation):
         outputs["half_width"] = np.tile(1.7 * deviation, (1, 1)).astype(np.float32)
         truths.append(truth)
         found.append(solve(outputs).outputs)
-    stacked = {name: np.concatenate([each[name] for each in found]) for name in found[0]}
-    return stacked, np.array(truths), found
+    return stacked(found), np.array(truths), found
 
 
 def position_error(solve, frames, truths):
@@ -178,7 +182,7 @@ def test_two_poses_are_better_than_either():
     generator = np.random.default_rng(2)
     deviation = np.array([0.005, 0.005, 0.005, 0.002, 0.002, 0.002])
     val, truths, frames = fused_frames(generator, 200, deviation)
-    tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val)
+    tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val, np.arange(200))
     assert tuned.fusion.share > 0.0
     together = position_error(FusedHead(tuned, "normalised").solver(CAMERA, INPUTS), frames, truths)
     solved = position_error(FusedHead(FUSED, "normalised").solver(CAMERA, INPUTS), frames, truths)
@@ -189,7 +193,7 @@ def test_two_poses_are_better_than_either():
 def test_a_useless_regression_does_no_harm():
     generator = np.random.default_rng(3)
     val, truths, frames = fused_frames(generator, 200, np.full(6, 0.5))
-    tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val)
+    tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val, np.arange(200))
     together = position_error(FusedHead(tuned, "normalised").solver(CAMERA, INPUTS), frames, truths)
     solved = position_error(FusedHead(FUSED, "normalised").solver(CAMERA, INPUTS), frames, truths)
     assert together < 1.02 * solved

@@ -159,11 +159,10 @@ def calibrated(
     with draft.observer(model_bytes, first) as observer:
         val = observe(observer, dataset, roles["val"])
         cal = observe(observer, dataset, roles["cal"])
+    known, sequence = in_order(val, cal)
     candidates = [
         candidate._replace(
-            parameters=draft.head(candidate).tuned(
-                val.outputs, val.true_pose, known_outputs(val, cal)
-            )
+            parameters=draft.head(candidate).tuned(val.outputs, val.true_pose, known, sequence)
         )
         for candidate in candidates
     ]
@@ -183,12 +182,14 @@ def calibrated(
     return draft.calibrated(head, found, counts(scored), selftest)
 
 
-def known_outputs(*observed: Observed) -> dict[str, NDArray[Any]]:
-    """Return the outputs of several roles, stacked."""
-    return {
-        name: np.concatenate([each.outputs[name] for each in observed])
+def in_order(*observed: Observed) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
+    """Return outputs and sequence numbers of several roles, stacked in the data set's order."""
+    order = np.argsort(np.concatenate([each.indices for each in observed]))
+    outputs = {
+        name: np.concatenate([each.outputs[name] for each in observed])[order]
         for name in observed[0].outputs
     }
+    return outputs, np.concatenate([each.sequence for each in observed])[order]
 
 
 def with_thresholds(

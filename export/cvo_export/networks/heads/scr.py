@@ -267,6 +267,7 @@ class ScrHead(ExportedHead):
             damping=six(_DAMPING * deviation),
             deviation_floor=six(_FLOOR * deviation),
             limits=None,
+            camera_limits=None,
         )
         return (Candidate("normalised", parameters),)
 

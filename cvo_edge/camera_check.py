@@ -1,0 +1,142 @@
+"""Whether the running camera is the one that was stated, from the frames of a stream.
+
+A frame whose pose was solved from scene coordinates also says a little about the camera
+(``PoseSolver.lens_evidence``). Each frame alone says too little, but evidence adds up: over a
+window of frames, a focal length that is off by a few percent or an unknown distortion shows.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from cvo_edge.bundle.format import Positive
+from cvo_edge.pose_solver import PoseSolver
+
+Array = NDArray[np.float64]
+
+# Frames whose evidence is added; fewer give no verdict.
+WINDOW = 30
+# Frames that the estimate uses at most, spread over the stream.
+_KEPT = 64
+# The least distinct directions keep an estimate of what the frames leave open near zero.
+_PRIOR = 1e-6
+
+
+class LensLimits(Struct, frozen=True, forbid_unknown_fields=True):
+    """The largest deviations that frames of the known camera may show over a window.
+
+    ``log_focal``: logarithm of the factor of either focal length; ``distortion``: additional k1.
+    """
+
+    log_focal: Positive
+    distortion: Positive
+
+
+class LensEstimate(NamedTuple):
+    """The camera that the frames show: factors of the stated fx and fy, and additional k1."""
+
+    fx: float
+    fy: float
+    k1: float
+    frames: int
+
+
+class CameraCheck:
+    """Compares the camera of a stream with the stated one; pass every solved frame once, in order.
+
+    Parameters
+    ----------
+    solver
+        The pose solver of the stated camera.
+    focal_px
+        Its focal length in pixels of the model's input.
+    limits
+        Deviations beyond which the camera differs.
+    error_px
+        Median reprojection error of the known place: a camera is only reported if it explains the
+        frames that well.
+    """
+
+    def __init__(
+        self, solver: PoseSolver, focal_px: float, limits: LensLimits, error_px: float
+    ) -> None:
+        self._solver, self._focal_px, self._error_px = solver, focal_px, error_px
+        self._limits = np.array([limits.log_focal, limits.log_focal, limits.distortion])
+        self._window: deque[tuple[Array, Array]] = deque(maxlen=WINDOW)
+        self._kept: list[tuple[Array, Array, Array]] = []
+        self._seen, self._stride = 0, 1
+
+    def differs(self, outputs: Mapping[str, NDArray[Any]], *, familiar: bool) -> bool:
+        """Add one frame; return whether the frames of the window show another camera.
+
+        A frame that is not ``familiar`` counts for the estimate alone, because a camera that is
+        quite different makes all frames unfamiliar.
+        """
+        if self._seen % self._stride == 0:
+            self._keep(outputs)
+        self._seen += 1
+        if familiar:
+            self._window.append((outputs["lens_gradient"][0], outputs["lens_information"][0]))
+        if len(self._window) < WINDOW:
+            return False
+        return bool((np.abs(summed(list(self._window))) > self._limits).any())
+
+    def estimate(self) -> LensEstimate | None:
+        """Return the camera that the frames show; None if none explains them, or for few frames."""
+        if len(self._kept) < WINDOW:
+            return None
+        lens, error = self._solver.lens_fit(self._kept)
+        if not np.median(error) * self._focal_px <= self._error_px:
+            return None
+        fx, fy = np.exp(lens[:2]).tolist()
+        return LensEstimate(fx, fy, float(lens[2]), len(self._kept))
+
+    def _keep(self, outputs: Mapping[str, NDArray[Any]]) -> None:
+        scale = np.exp(outputs["log_scale_px"][0].astype(np.float64)) / self._focal_px
+        pose = outputs["solved_pose"][0]
+        self._kept.append((outputs["coordinates"][0].astype(np.float64), scale, pose))
+        if len(self._kept) > _KEPT:
+            self._kept = self._kept[::2]
+            self._stride *= 2
+
+
+def summed(evidence: Sequence[tuple[Array, Array]]) -> Array:
+    """Gradients (3,) and informations (3, 3) of several frames -> the lens (3,) they show."""
+    gradient, information = (np.sum(each, axis=0) for each in zip(*evidence, strict=True))
+    return np.linalg.solve(information + _PRIOR * np.eye(3), gradient)
+
+
+def fitted_limits(
+    gradient: Array, information: Array, sequence: NDArray[np.int64], share: float, margin: float
+) -> LensLimits | None:
+    """Limits from frames of the known camera: n gradients, informations and sequence numbers.
+
+    At most a ``share`` of new recordings shows more, by the conformal quantile over recordings.
+    With too few recordings for that, the limits lie beyond the largest by the factor ``margin``.
+    None if no recording fills a window.
+    """
+    largest = []
+    for number in np.unique(sequence):
+        frames = np.flatnonzero(sequence == number)
+        starts = range(len(frames) - WINDOW + 1)
+        found = [
+            summed([(gradient[i], information[i]) for i in frames[start : start + WINDOW]])
+            for start in starts
+        ]
+        if found:
+            lens = np.abs(found).max(axis=0)
+            largest.append((lens[:2].max(), lens[2]))
+    if not largest:
+        return None
+    ordered = np.sort(largest, axis=0)
+    rank = int(np.ceil((len(ordered) + 1) * (1.0 - share)))
+    log_focal, distortion = (
+        ordered[rank - 1] if rank <= len(ordered) else margin * ordered[-1]
+    ).tolist()
+    return LensLimits(log_focal, distortion)

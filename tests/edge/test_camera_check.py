@@ -1,0 +1,162 @@
+"""The camera check: evidence of single frames, its sum over a stream, the camera it reports."""
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from cvo_edge import geometry
+from cvo_edge.camera_check import WINDOW, CameraCheck, LensLimits, fitted_limits, summed
+from cvo_edge.pose_solver import NU, PoseSolver
+
+START = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+FOCAL_PX = 240.0
+LIMITS = LensLimits(log_focal=0.02, distortion=0.05)
+
+
+def grid_rays():
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 16), np.linspace(-0.4, 0.4, 12))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def solver():
+    return PoseSolver(grid_rays(), START, np.ones(6))
+
+
+def seen_by(lens, generator, noise=0.002):
+    """Points, scale and solved pose of a frame whose true camera differs by ``lens``."""
+    shown = grid_rays()
+    ideal = shown.copy()
+    for _ in range(50):  # inverse of the distortion
+        radial = 1.0 + lens[2] * np.square(ideal).sum(axis=1, keepdims=True)
+        ideal = shown / (np.exp(lens[:2]) * radial)
+    ideal += generator.normal(0.0, noise, ideal.shape)
+    depth = generator.uniform(1.0, 4.0, (len(ideal), 1))
+    local = np.column_stack([ideal, np.ones(len(ideal))]) * depth
+    q = geometry.quaternion_exp(generator.normal(0.0, 0.1, 3))
+    points = local @ geometry.quaternion_to_matrix(q).T + generator.normal(0.0, 0.1, 3)
+    scale = np.full(len(ideal), noise)
+    return points, scale, solver().solve(points, scale).pose
+
+
+def outputs_of(points, scale, pose):
+    evidence = solver().lens_evidence(points, scale, pose)
+    return {
+        "coordinates": points[np.newaxis],
+        "log_scale_px": np.log(scale * FOCAL_PX)[np.newaxis],
+        "solved_pose": pose[np.newaxis],
+        "lens_gradient": evidence.gradient[np.newaxis],
+        "lens_information": evidence.information[np.newaxis],
+    }
+
+
+def check():
+    return CameraCheck(solver(), FOCAL_PX, LIMITS, error_px=1.0)
+
+
+def test_evidence_is_the_derivative_of_the_profiled_likelihood():
+    # Oracle: scipy fits the pose again for a slightly different camera.
+    points, scale, pose = seen_by(np.zeros(3), np.random.default_rng(0))
+    evidence = solver().lens_evidence(points, scale, pose)
+
+    def loss(step, lens):
+        q = geometry.quaternion_multiply(pose[3:], geometry.quaternion_exp(step[3:]))
+        local = (points - pose[:3] - step[:3]) @ geometry.quaternion_to_matrix(q)
+        image = local[:, :2] / local[:, 2:]
+        radial = 1.0 + lens[2] * np.square(image).sum(axis=1, keepdims=True)
+        squared = np.square(image * radial * np.exp(lens[:2]) - grid_rays()).sum(axis=1)
+        return 0.5 * (NU + 2.0) * np.log1p(squared / (NU * np.square(scale))).sum()
+
+    def profiled(lens):
+        found = minimize(loss, np.zeros(6), args=(lens,), method="BFGS", options={"gtol": 1e-3})
+        return -found.fun
+
+    h = 0.1 / np.sqrt(np.diag(evidence.information))
+    at, steps = profiled(np.zeros(3)), np.diag(h)
+    up, down = ([profiled(sign * step) for step in steps] for sign in (1.0, -1.0))
+    np.testing.assert_allclose(
+        evidence.gradient * h, (np.array(up) - np.array(down)) / 2.0, atol=2e-4
+    )
+    second = 2.0 * at - np.array(up) - np.array(down)
+    # The image's own curvature is left out, as in every Gauss-Newton method.
+    np.testing.assert_allclose(np.diag(evidence.information) * h * h, second, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    "lens", [(0.0, 0.0, 0.0), (0.05, 0.05, 0.0), (-0.05, -0.05, 0.0), (0.05, 0.0, 0.0)]
+)
+def test_a_window_of_frames_shows_five_percent(lens):
+    generator = np.random.default_rng(1)
+    stream = check()
+    found = [
+        stream.differs(outputs_of(*seen_by(np.array(lens), generator)), familiar=True)
+        for _ in range(WINDOW + 10)
+    ]
+    assert not any(found[: WINDOW - 1])
+    assert set(found[WINDOW - 1 :]) == {any(lens)}
+
+
+@pytest.mark.parametrize("lens", [(0.0, 0.0, 0.0), (0.2, 0.2, 0.0), (0.1, 0.0, 0.0), (0, 0, -0.3)])
+def test_the_camera_is_reported(lens):
+    generator = np.random.default_rng(2)
+    stream = check()
+    for _ in range(150):
+        stream.differs(outputs_of(*seen_by(np.array(lens), generator)), familiar=False)
+    fx, fy, k1, frames = stream.estimate()
+    np.testing.assert_allclose(np.log([fx, fy]), lens[:2], atol=0.01)
+    assert k1 == pytest.approx(lens[2], abs=0.03)
+    assert WINDOW <= frames <= 64
+
+
+def test_frames_of_another_place_show_no_camera():
+    generator = np.random.default_rng(3)
+    stream = check()
+    for _ in range(WINDOW):
+        points, scale, _ = seen_by(np.zeros(3), generator)
+        shuffled = generator.permutation(points)
+        pose = solver().solve(shuffled, scale).pose
+        assert not stream.differs(outputs_of(shuffled, scale, pose), familiar=False)
+    assert stream.estimate() is None
+
+
+def test_few_frames_show_no_camera():
+    stream = check()
+    frame = outputs_of(*seen_by(np.zeros(3), np.random.default_rng(4)))
+    for _ in range(WINDOW - 1):
+        stream.differs(frame, familiar=True)
+    assert stream.estimate() is None
+
+
+def evidence_of(recordings, generator):
+    frames = [
+        solver().lens_evidence(*seen_by(np.array([0.001 * number, 0.0, 0.0]), generator))
+        for number in range(recordings)
+        for _ in range(WINDOW)
+    ]
+    gradient, information = (np.array(each) for each in zip(*frames, strict=True))
+    return gradient, information, np.repeat(np.arange(recordings), WINDOW)
+
+
+def test_limits_let_few_recordings_of_the_known_camera_through():
+    gradient, information, sequence = evidence_of(20, np.random.default_rng(5))
+    limits = fitted_limits(gradient, information, sequence, share=0.1, margin=1.5)
+    found = [
+        np.abs(summed(list(zip(gradient[chosen], information[chosen], strict=True))))
+        for chosen in (sequence == number for number in range(20))
+    ]
+    # 21 * 0.9 = 18.9: the 19th of 20.
+    assert sum(max(lens[:2]) > limits.log_focal for lens in found) == 1
+
+
+def test_limits_of_a_single_recording_lie_beyond_it():
+    gradient, information, sequence = evidence_of(1, np.random.default_rng(6))
+    limits = fitted_limits(gradient, information, sequence, share=0.05, margin=1.5)
+    found = np.abs(summed(list(zip(gradient, information, strict=True))))
+    assert limits.log_focal == pytest.approx(1.5 * found[:2].max())
+    assert limits.distortion == pytest.approx(1.5 * found[2])
+    assert msgspec.json.decode(msgspec.json.encode(limits), type=LensLimits) == limits
+
+
+def test_recordings_shorter_than_a_window_give_no_limits():
+    gradient, information, sequence = evidence_of(1, np.random.default_rng(7))
+    assert fitted_limits(gradient[1:], information[1:], sequence[1:], 0.05, 1.5) is None
