@@ -21,9 +21,16 @@ from cvo_edge.pose_solver import PoseSolver
 Array = NDArray[np.float64]
 
 # Frames whose evidence is added; fewer give no verdict.
-WINDOW = 30
+WINDOW = 20
+# Frames in which a larger share of cells contradicts the pose are no evidence: what seems to be
+# another camera may be a part of the place that the network knows badly.
+_CONTRADICTING = 0.25
 # Frames that the estimate uses at most, spread over the stream.
 _KEPT = 64
+# Limits in units of what the median recording of the known camera shows at most. The largest would
+# be a poor measure: one badly known recording would switch the check off. Distortion is less
+# certain, as only the corners of an image show it.
+_FOCAL_MARGIN, _DISTORTION_MARGIN = 3.5, 6.0
 # The least distinct directions keep an estimate of what the frames leave open near zero.
 _PRIOR = 1e-6
 
@@ -81,7 +88,7 @@ class CameraCheck:
         if self._seen % self._stride == 0:
             self._keep(outputs)
         self._seen += 1
-        if familiar:
+        if familiar and _is_evidence(outputs["signs"])[0]:
             self._window.append((outputs["lens_gradient"][0], outputs["lens_information"][0]))
         if len(self._window) < WINDOW:
             return False
@@ -113,30 +120,30 @@ def summed(evidence: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def fitted_limits(
-    gradient: Array, information: Array, sequence: NDArray[np.int64], share: float, margin: float
+    outputs: Mapping[str, NDArray[Any]], sequence: NDArray[np.int64]
 ) -> LensLimits | None:
-    """Limits from frames of the known camera: n gradients, informations and sequence numbers.
+    """Limits from frames of the known camera: stacked outputs of n frames and sequence numbers.
 
-    At most a ``share`` of new recordings shows more, by the conformal quantile over recordings.
-    With too few recordings for that, the limits lie beyond the largest by the factor ``margin``.
     None if no recording fills a window.
     """
     largest = []
+    evidence = _is_evidence(outputs["signs"])
+    gradient, information = outputs["lens_gradient"], outputs["lens_information"]
     for number in np.unique(sequence):
-        frames = np.flatnonzero(sequence == number)
-        starts = range(len(frames) - WINDOW + 1)
+        frames = np.flatnonzero((sequence == number) & evidence)
         found = [
             summed([(gradient[i], information[i]) for i in frames[start : start + WINDOW]])
-            for start in starts
+            for start in range(len(frames) - WINDOW + 1)
         ]
         if found:
             lens = np.abs(found).max(axis=0)
             largest.append((lens[:2].max(), lens[2]))
     if not largest:
         return None
-    ordered = np.sort(largest, axis=0)
-    rank = int(np.ceil((len(ordered) + 1) * (1.0 - share)))
-    log_focal, distortion = (
-        ordered[rank - 1] if rank <= len(ordered) else margin * ordered[-1]
-    ).tolist()
-    return LensLimits(log_focal, distortion)
+    log_focal, distortion = np.median(largest, axis=0).tolist()
+    return LensLimits(_FOCAL_MARGIN * log_focal, _DISTORTION_MARGIN * distortion)
+
+
+def _is_evidence(signs: NDArray[Any]) -> NDArray[np.bool_]:
+    """Signs of n frames (n, 2) -> whether each frame is evidence."""
+    return np.asarray(signs[:, 1] <= _CONTRADICTING)

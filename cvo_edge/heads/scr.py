@@ -57,9 +57,6 @@ _LEAST_ERROR_PX = 0.1
 # Where most of the best cells contradict the pose, a frame is lost, even if it was calibrated on:
 # frames between the trained ones may show parts of the place that no trained frame shows.
 _LOST = 0.5
-# Share of new recordings of the known camera that may seem to differ, and the margin for data sets
-# with too few recordings to tell.
-_CAMERA_SHARE, _CAMERA_MARGIN = 0.05, 1.5
 
 
 class Signs(Struct, frozen=True, forbid_unknown_fields=True):
@@ -209,13 +206,7 @@ class ScrHead(Head):
             max(error_px, _LEAST_ERROR_PX) * _MARGIN_ERROR,
             min(_LOST, contradicting + _MARGIN_CONTRADICTING),
         )
-        camera_limits = fitted_limits(
-            known["lens_gradient"][located],
-            known["lens_information"][located],
-            sequence[located],
-            _CAMERA_SHARE,
-            _CAMERA_MARGIN,
-        )
+        camera_limits = fitted_limits(known, sequence)
         return replace(self.parameters, limits=limits, camera_limits=camera_limits)
 
     def joint_scale(self, scores: Array) -> JointScale:
