@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 WINDOW = 20
 # Frames in which a larger share of cells contradicts the pose are no evidence: what seems to be
 # another camera may be a part of the place that the network knows badly.
-_CONTRADICTING = 0.25
+_CONTRADICTING = 0.3
 # Frames that the estimate uses at most, spread over the stream.
 _KEPT = 64
 # Limits in units of what the median recording of the known camera shows at most. The largest would
