@@ -95,7 +95,7 @@ class PoseSolver:
             R, t, found = self._step(R, t, X, factor * spread, newton=False)
         for _ in range(_NEWTON_STEPS):
             R, t, found = self._step(R, t, X, spread, newton=True)
-        pose = np.concatenate([t, geometry.matrix_to_quaternion(R)])
+        pose = np.array([*t.tolist(), *_quaternion(*R.ravel().tolist())])
         return Solution(pose, _in_world(found.information, R), found.squared, found.length)
 
     def _start(self, X: Array, spread: Array) -> tuple[Array, Array]:
@@ -211,15 +211,15 @@ class PoseSolver:
         X = np.ascontiguousarray(points.T, dtype=np.float64)
         spread = NU * np.square(scale, dtype=np.float64)
         image, J, ahead = self._projected(R, t, X)
-        zoom, r2 = np.exp(lens[:2])[:, np.newaxis], image[0] * image[0] + image[1] * image[1]
-        shown = _distorted(image, lens)
-        full = np.zeros((9, *image.shape))
-        full[:6] = J
+        r2 = image[0] * image[0] + image[1] * image[1]
+        shown, bent = image, r2 * image
         if lens.any():
             # d shown = zoom ((1 + k r^2) d image + 2 k image (image . d image)).
-            along = (J * image).sum(axis=1)[:, np.newaxis]
-            full[:6] = zoom * ((1.0 + lens[2] * r2) * J + 2.0 * lens[2] * image * along)
-        full[6, 0], full[7, 1], full[8] = shown[0], shown[1], zoom * r2 * image
+            zoom, along = np.exp(lens[:2])[:, np.newaxis], (J * image).sum(axis=1)[:, np.newaxis]
+            J = zoom * ((1.0 + lens[2] * r2) * J + 2.0 * lens[2] * image * along)
+            shown, bent = _distorted(image, lens), zoom * bent
+        full = np.zeros((9, *image.shape))
+        full[:6], full[6, 0], full[7, 1], full[8] = J, shown[0], shown[1], bent
         error = shown - self._rays
         squared = error[0] * error[0] + error[1] * error[1]
         weight = (NU + 2.0) / (spread + squared)
@@ -308,6 +308,30 @@ def _rotation(x: float, y: float, z: float) -> Array:
             (b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)),
         )
     )
+
+
+def _quaternion(
+    xx: float,
+    xy: float,
+    xz: float,
+    yx: float,
+    yy: float,
+    yz: float,
+    zx: float,
+    zy: float,
+    zz: float,
+) -> tuple[float, float, float, float]:
+    """Rotation matrix by rows -> unit quaternion x y z w, w >= 0 (Shepperd 1978)."""
+    if xx + yy + zz > 0.0:
+        q = (zy - yz, xz - zx, yx - xy, 1.0 + xx + yy + zz)
+    elif xx >= yy and xx >= zz:
+        q = (1.0 + xx - yy - zz, xy + yx, xz + zx, zy - yz)
+    elif yy >= zz:
+        q = (xy + yx, 1.0 - xx + yy - zz, yz + zy, xz - zx)
+    else:
+        q = (xz + zx, yz + zy, 1.0 - xx - yy + zz, yx - xy)
+    scale = math.copysign(1.0 / math.hypot(*q), q[3])
+    return q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
 
 
 def _in_world(information: Array, R: Array) -> Array:
