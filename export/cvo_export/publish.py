@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from cvo_edge.bundle.format import Calibration, PoseSpec, PreprocessSpec, Provenance
 from cvo_edge.engine.session import Session
@@ -78,6 +79,16 @@ def publish(
     return write_bundle(bundle_dir, calibration, model_bytes)
 
 
+class _Deployed(nn.Module):
+    def __init__(self, backbone: nn.Module, head: nn.Module) -> None:
+        super().__init__()
+        self.backbone, self.head = backbone, head
+
+    def forward(self, image: torch.Tensor, *extra: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        outputs: tuple[torch.Tensor, ...] = self.head(self.backbone(image), *extra)
+        return outputs
+
+
 def _export(run: Run, precision: Precision) -> tuple[bytes, float]:
     """Return the model bytes and the largest difference between torch and onnxruntime on val.
 
@@ -87,7 +98,8 @@ def _export(run: Run, precision: Precision) -> tuple[bytes, float]:
     image = torch.zeros((1, config.height, config.width, 3), dtype=torch.uint8)
     names = ["image", *head.extra_inputs]
     inputs = [image, *head.extra_inputs.values()]
-    content = export_onnx(run.graph, inputs, names, head.output_names)
+    graph = _Deployed(run.graph.backbone, head.deployed()).eval()
+    content = export_onnx(graph, inputs, names, head.output_names)
     feeds = _feeds(run, run.split.roles["val"][:_PARITY_FRAMES])
     session = Session(content)
     parity = check_parity(run.graph, session, feeds, names)

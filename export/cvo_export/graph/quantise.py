@@ -2,9 +2,9 @@
 
 Weights are int8 with one scale per output channel; feature maps are uint8 with one scale each, from
 their ranges on training frames. Both use pairs of QuantizeLinear and DequantizeLinear (QDQ), which
-the kernels of every processor support. The head stays in float32: it takes a hundredth of the
-arithmetic, and its outputs are metres. Thresholds come from the quantised graph, so they include
-the quantisation error.
+the kernels of every processor support. The head stays in float32, because its outputs are metres
+and it takes a hundredth of the arithmetic; layers that a head applies to every cell of a map count
+as the backbone. Thresholds come from the quantised graph, so they include the quantisation error.
 """
 
 from __future__ import annotations

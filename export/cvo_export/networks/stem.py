@@ -63,8 +63,8 @@ class Upper(nn.Module):
 
     Attributes
     ----------
-    size
-        Features per cell.
+    size, stem_channels
+        Features per cell, and channels of the stem's map.
     shape
         Channels, rows and columns of the last map.
     """
@@ -72,7 +72,7 @@ class Upper(nn.Module):
     def __init__(self, layers: nn.Sequential) -> None:
         super().__init__()
         self.layers = layers
-        self.size = 0
+        self.size = self.stem_channels = 0
         self.shape = (0, 0, 0)
 
     @property
@@ -131,7 +131,7 @@ def split_backbone(
                 "of plain stages, e.g. of the MobileNet, EfficientNet or ResNet families"
             )
         stem.shape = _three(found)
-        cells.size = int(cells(found).shape[2])
+        cells.size, cells.stem_channels = int(cells(found).shape[2]), stem.size
         cells.shape = _three(deep)
     return stem, cells, sha256
 

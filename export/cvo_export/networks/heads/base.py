@@ -126,6 +126,10 @@ class ExportedHead(nn.Module):
     def candidates(self) -> tuple[Candidate, ...]:
         """Return the scores val chooses from; the first wins unless another is clearly better."""
 
+    def deployed(self) -> nn.Module:
+        """Return the module to export, by default itself: the same outputs at a lower cost."""
+        return self
+
     def choices(self) -> Mapping[str, float]:
         """Return what val chose inside this head, for the provenance; empty by default."""
         return {}

@@ -27,7 +27,13 @@ from cvo_export.networks.heads.base import (
 )
 from cvo_export.networks.heads.cjp import CjpConfig, CjpLearner, CjpNetwork
 from cvo_export.networks.heads.scr import METHOD as SCR
-from cvo_export.networks.heads.scr import ScrConfig, ScrHead, restored_scr, trained_scr
+from cvo_export.networks.heads.scr import (
+    DeployedScr,
+    ScrConfig,
+    ScrHead,
+    restored_scr,
+    trained_scr,
+)
 from cvo_export.networks.standardised import PoseDecoder
 from cvo_export.networks.stem import Upper
 
@@ -81,11 +87,18 @@ class FusedHead(ExportedHead):
         upper = self.scr.upper
         deep = upper.deep(features)
         points, log_scale = self.scr.network(upper.cells(features, deep))
-        point, lower, upper_bound = (
+        return points, log_scale, *self.regressed(deep)
+
+    def deployed(self) -> nn.Module:
+        """As ``ExportedHead``."""
+        return _DeployedFused(self)
+
+    def regressed(self, deep: Tensor) -> tuple[Tensor, Tensor]:
+        """Map of the last stage -> pose (n, 7) and half-widths (n, 6)."""
+        point, lower, upper = (
             self.decoder(values) for values in self.regression(self.pooled(deep))
         )
-        half_width = 0.5 * (upper_bound - lower)
-        return points, log_scale, self.decoder.pose(point), half_width
+        return self.decoder.pose(point), 0.5 * (upper - lower)
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Return the only score."""
@@ -93,6 +106,16 @@ class FusedHead(ExportedHead):
         fields = {name: getattr(alone, name) for name in alone.__struct_fields__}
         parameters = FusedParameters(**fields, focal_px=float(self.focal_px), fusion=None)
         return (Candidate("normalised", parameters),)
+
+
+class _DeployedFused(nn.Module):
+    def __init__(self, head: FusedHead) -> None:
+        super().__init__()
+        self.scr, self.head = DeployedScr(head.scr), head
+
+    def forward(self, stem_map: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        points, log_scale, deep = self.scr.maps(stem_map)
+        return points, log_scale, *self.head.regressed(deep)
 
 
 def _train(lessons: Lessons, config: FusedConfig) -> FusedHead:

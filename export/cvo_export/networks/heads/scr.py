@@ -50,7 +50,7 @@ from cvo_export.networks.heads.base import (
     Setting,
     Standardise,
 )
-from cvo_export.networks.stem import Upper
+from cvo_export.networks.stem import CELL_STRIDE, STEM_STRIDE, Upper
 
 Array = NDArray[np.float64]
 
@@ -89,7 +89,10 @@ class CellNetwork(nn.Module):
         super().__init__()
         self.standardise = Standardise(size, 0.0)
         self.first = nn.Linear(size, config.width)
-        self.blocks = nn.ModuleList(_Residual(config.width) for _ in range(config.blocks))
+        self.blocks = nn.ModuleList(
+            _Residual(nn.Linear(config.width, config.width), nn.Linear(config.width, config.width))
+            for _ in range(config.blocks)
+        )
         self.last = nn.Linear(config.width, 5)
         # Training starts from the middle of the known points.
         nn.init.zeros_(self.last.weight)
@@ -107,16 +110,69 @@ class CellNetwork(nn.Module):
             hidden = self.first(self.standardise(features))
             for block in self.blocks:
                 hidden = block(hidden)
-        output = self.last(torch.relu(hidden.float()))
+        return self.read(hidden.float())
+
+    def read(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Values of the last block (..., width) -> points and log scales."""
+        output = self.last(torch.relu(hidden))
         homogeneous = softplus(output[..., 3:4] + _ONE).clamp(*_HOMOGENEOUS)
         points = self.centre + self.spread * output[..., :3] / homogeneous
         return points, (output[..., 4] + _FIRST_LOG_SCALE).clamp(*_LOG_SCALES)
 
 
-class _Residual(nn.Module):
-    def __init__(self, width: int) -> None:
+class CellMaps(nn.Module):
+    """A ``CellNetwork`` on maps: the stem's and the last stage's -> (n, cells, 3) and (n, cells).
+
+    Its layers are the same numbers as convolutions. They need no rearranged maps, and can be
+    quantised like a backbone's; the last layer, whose outputs are metres, stays as it is.
+    """
+
+    def __init__(self, network: CellNetwork, channels: int) -> None:
         super().__init__()
-        self.inner, self.outer = nn.Linear(width, width), nn.Linear(width, width)
+        scale = 1.0 / network.standardise.std
+        weight = network.first.weight * scale
+        bias = network.first.bias - weight @ network.standardise.mean
+        # The features of a cell begin with a block of the stem's map, channel by channel.
+        side = CELL_STRIDE // STEM_STRIDE
+        fine, deep = weight[:, : channels * side**2], weight[:, channels * side**2 :]
+        self.fine = _convolution(fine.reshape(-1, channels, side, side), None)
+        self.deep = _convolution(deep[..., None, None], bias)
+        self.blocks = nn.ModuleList(
+            _Residual(_pointwise(block.inner), _pointwise(block.outer))
+            for block in network.blocks
+            if isinstance(block, _Residual)
+        )
+        self.read = network.read
+
+    def forward(self, stem_map: Tensor, deep: Tensor) -> tuple[Tensor, Tensor]:
+        """Return points and log scales."""
+        hidden = self.deep(deep) + self.fine(stem_map)
+        for block in self.blocks:
+            hidden = block(hidden)
+        found: tuple[Tensor, Tensor] = self.read(hidden.flatten(2).transpose(1, 2))
+        return found
+
+
+def _convolution(weight: Tensor, bias: Tensor | None) -> nn.Conv2d:
+    """Return the convolution with these weights, whose kernels do not overlap."""
+    outputs, inputs, side, _ = weight.shape
+    found = nn.Conv2d(inputs, outputs, side, stride=side, bias=bias is not None)
+    with torch.no_grad():
+        found.weight.copy_(weight)
+        if found.bias is not None and bias is not None:
+            found.bias.copy_(bias)
+    return found
+
+
+def _pointwise(layer: nn.Linear | nn.Conv2d) -> nn.Conv2d:
+    """Return a linear layer as a convolution."""
+    return _convolution(layer.weight[..., None, None], layer.bias)
+
+
+class _Residual(nn.Module):
+    def __init__(self, inner: nn.Linear | nn.Conv2d, outer: nn.Linear | nn.Conv2d) -> None:
+        super().__init__()
+        self.inner, self.outer = inner, outer
 
     def forward(self, x: Tensor) -> Tensor:
         found: Tensor = x + self.outer(torch.relu(self.inner(torch.relu(x))))
@@ -257,6 +313,10 @@ class ScrHead(ExportedHead):
         points, log_scale = self.network(self.upper(features))
         return points, log_scale
 
+    def deployed(self) -> nn.Module:
+        """As ``ExportedHead``."""
+        return DeployedScr(self)
+
     def candidates(self) -> tuple[Candidate, ...]:
         """Return the only score."""
         deviation = self.deviation.numpy()
@@ -270,6 +330,26 @@ class ScrHead(ExportedHead):
             camera_limits=None,
         )
         return (Candidate("normalised", parameters),)
+
+
+class DeployedScr(nn.Module):
+    """``ScrHead`` for the exported graph; ``maps`` also returns the map of the last stage."""
+
+    def __init__(self, head: ScrHead) -> None:
+        super().__init__()
+        self.upper = head.upper
+        self.network = CellMaps(head.network, head.upper.stem_channels)
+
+    def maps(self, stem_map: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return coordinates, the logarithms of their scales and the map of the last stage."""
+        deep = self.upper.deep(stem_map)
+        points, log_scale = self.network(stem_map, deep)
+        return points, log_scale, deep
+
+    def forward(self, stem_map: Tensor) -> tuple[Tensor, Tensor]:
+        """Return coordinates and the logarithms of their scales."""
+        points, log_scale, _ = self.maps(stem_map)
+        return points, log_scale
 
 
 def spread_poses(poses: Array, count: int) -> Array:
