@@ -22,9 +22,10 @@ Array = NDArray[np.float64]
 
 # Frames whose evidence is added; fewer give no verdict.
 WINDOW = 20
-# Frames in which a larger share of cells contradicts the pose are no evidence: what seems to be
-# another camera may be a part of the place that the network knows badly.
-_CONTRADICTING = 0.3
+# Frames in which a larger share of cells contradicts the pose are weak evidence: what seems to be
+# another camera may be a part of the place that the network knows badly. With them, the limits are
+# wider by a factor; without them, a camera that is far off would leave no evidence.
+_CONTRADICTING, _WEAK = 0.3, 2.0
 # Frames that the estimate uses at most, spread over the stream.
 _KEPT = 64
 # Limits in units of what the median recording of the known camera shows at most. The largest would
@@ -75,7 +76,8 @@ class CameraCheck:
     ) -> None:
         self._solver, self._focal_px, self._error_px = solver, focal_px, error_px
         self._limits = np.array([limits.log_focal, limits.log_focal, limits.distortion])
-        self._window: deque[tuple[Array, Array]] = deque(maxlen=WINDOW)
+        self._clear: deque[tuple[Array, Array]] = deque(maxlen=WINDOW)
+        self._familiar: deque[tuple[Array, Array]] = deque(maxlen=WINDOW)
         self._kept: list[tuple[Array, Array, Array]] = []
         self._seen, self._stride = 0, 1
 
@@ -88,11 +90,15 @@ class CameraCheck:
         if self._seen % self._stride == 0:
             self._keep(outputs)
         self._seen += 1
-        if familiar and _is_evidence(outputs["signs"])[0]:
-            self._window.append((outputs["lens_gradient"][0], outputs["lens_information"][0]))
-        if len(self._window) < WINDOW:
-            return False
-        return bool((np.abs(summed(list(self._window))) > self._limits).any())
+        evidence = outputs["lens_gradient"][0], outputs["lens_information"][0]
+        if familiar:
+            self._familiar.append(evidence)
+            if _is_clear(outputs["signs"])[0]:
+                self._clear.append(evidence)
+        return any(
+            len(window) == WINDOW and (np.abs(summed(list(window))) > factor * self._limits).any()
+            for window, factor in ((self._clear, 1.0), (self._familiar, _WEAK))
+        )
 
     def estimate(self) -> LensEstimate | None:
         """Return the camera that the frames show; None if none explains them, or for few frames."""
@@ -127,10 +133,10 @@ def fitted_limits(
     None if no recording fills a window.
     """
     largest = []
-    evidence = _is_evidence(outputs["signs"])
+    clear = _is_clear(outputs["signs"])
     gradient, information = outputs["lens_gradient"], outputs["lens_information"]
     for number in np.unique(sequence):
-        frames = np.flatnonzero((sequence == number) & evidence)
+        frames = np.flatnonzero((sequence == number) & clear)
         found = [
             summed([(gradient[i], information[i]) for i in frames[start : start + WINDOW]])
             for start in range(len(frames) - WINDOW + 1)
@@ -144,6 +150,6 @@ def fitted_limits(
     return LensLimits(_FOCAL_MARGIN * log_focal, _DISTORTION_MARGIN * distortion)
 
 
-def _is_evidence(signs: NDArray[Any]) -> NDArray[np.bool_]:
-    """Signs of n frames (n, 2) -> whether each frame is evidence."""
+def _is_clear(signs: NDArray[Any]) -> NDArray[np.bool_]:
+    """Signs of n frames (n, 2) -> whether each frame is clear evidence."""
     return np.asarray(signs[:, 1] <= _CONTRADICTING)

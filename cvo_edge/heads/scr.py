@@ -249,6 +249,20 @@ class ScrHead(Head):
         """As ``Head``; other data need other limits."""
         return (Candidate(self.score, replace(self.parameters, limits=None, camera_limits=None)),)
 
+    def description(self) -> str:
+        """As ``Head``."""
+        rows, columns = self.parameters.grid
+        text = f"{columns}x{rows} cells"
+        limits, camera = self.parameters.limits, self.parameters.camera_limits
+        if limits is not None:
+            text += (
+                f", refused beyond {limits.error_px:.2g} px or {limits.contradicting:.0%} of cells "
+                "that contradict"
+            )
+        if camera is not None:
+            text += f", focal length checked to {camera.log_focal:.1%}"
+        return text
+
     def joint_description(self, joint: Joint) -> str:
         """As ``Head``."""
         return "distance by the solver's covariance"

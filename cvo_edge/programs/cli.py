@@ -22,6 +22,7 @@ from cvo_edge.programs.options import (
     CameraOption,
     JsonOption,
     PublicKeyOption,
+    RegionOption,
     ThreadsOption,
     examples,
 )
@@ -90,14 +91,7 @@ def run(
             rich_help_panel=REPORT,
         ),
     ] = None,
-    region: Annotated[
-        bool,
-        typer.Option(
-            "--region",
-            help="Write the region into every record (mcqr, scr, fused; joint scope).",
-            rich_help_panel=REPORT,
-        ),
-    ] = False,
+    region: RegionOption = False,
     ground_truth: Annotated[
         Path | None,
         typer.Option(

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 
 from cvo_edge.bundle.format import Calibration, CalibrationSpec
+from cvo_edge.camera import Camera
 from cvo_edge.conformal import least_draws
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.heads import HEADS, Head
@@ -39,6 +40,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
             f"on {source.n} frames of {source.n_sequences} sequence(s) of {source.dataset}, split "
             f"{source.split.kind} (seed {source.split.seed}), {source.rule}{_worth(source)}",
         ),
+        *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
         *_entry("backbone", calibration.provenance.backbone or "a network supplied as ONNX"),
         "",
@@ -52,6 +54,14 @@ def inspect_lines(calibration: Calibration) -> list[str]:
             cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>10}" for v in values)
             lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<18}" + cells)
     return lines + _unbounded(calibration, head)
+
+
+def _camera(camera: Camera) -> str:
+    lens = ", ".join(f"{value:g}" for value in camera.coefficients)
+    return (
+        f"{camera.width}x{camera.height}, fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, "
+        f"cy {camera.cy:g}, {camera.distortion} distortion" + (f" {lens}" if lens else "")
+    )
 
 
 def _entry(label: str, text: str) -> list[str]:

@@ -53,4 +53,12 @@ CameraOption = Annotated[
         rich_help_panel="Input",
     ),
 ]
+RegionOption = Annotated[
+    bool,
+    typer.Option(
+        "--region",
+        help="Write the region into every record (mcqr, scr, fused; joint scope).",
+        rich_help_panel=REPORT,
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]

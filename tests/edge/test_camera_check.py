@@ -161,10 +161,14 @@ def test_recordings_without_a_window_of_evidence_give_no_limits():
     assert fitted_limits(outputs, sequence) is None
 
 
-def test_frames_that_contradict_are_no_evidence():
+@pytest.mark.parametrize(("log_focal", "differs"), [(0.022, False), (0.06, True)])
+def test_frames_that_contradict_are_weak_evidence(log_focal, differs):
     generator = np.random.default_rng(8)
     stream = check()
+    found = []
     for _ in range(2 * WINDOW):
-        outputs = outputs_of(*seen_by(np.array([0.05, 0.05, 0.0]), generator))
-        outputs["signs"][0, 1] = 0.9
-        assert not stream.differs(outputs, familiar=True)
+        outputs = outputs_of(*seen_by(np.array([log_focal, log_focal, 0.0]), generator))
+        outputs["signs"][0, 1] = 0.4
+        found.append(stream.differs(outputs, familiar=True))
+    assert not any(found[: WINDOW - 1])
+    assert set(found[WINDOW - 1 :]) == {differs}
