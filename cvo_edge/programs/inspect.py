@@ -60,7 +60,7 @@ def _camera(camera: Camera) -> str:
     lens = ", ".join(f"{value:g}" for value in camera.coefficients)
     return (
         f"{camera.width}x{camera.height}, fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, "
-        f"cy {camera.cy:g}, {camera.distortion} distortion" + (f" {lens}" if lens else "")
+        f"cy {camera.cy:g}" + (f", {camera.distortion} {lens}" if lens else "")
     )
 
 
