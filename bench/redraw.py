@@ -1,0 +1,124 @@
+"""What each rule promises for new recordings: calibration recordings drawn again many times.
+
+    python bench/redraw.py BUNDLE DATASET [--deals 300] [--json FILE]
+
+The network, val and the self-check stay fixed. In each deal as many recordings as the bundle was
+calibrated on are drawn from those of cal and test; the others are tested. Figures are means over
+all deals at 0.9: coverage per degree of freedom, joint coverage, width and interval score.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from provenance import write_result
+
+from cvo_edge.conformal import interval_score
+from cvo_edge.engine.loading import read_bundle
+from cvo_edge.errors import UsageError
+from cvo_edge.heads import Head
+from cvo_edge.odometer import Odometer
+from cvo_edge.vocabulary import Rule
+from cvo_export.bundles.thresholds import Observed, Scored, observe, thresholds
+from cvo_export.data.splits import same_split
+from cvo_export.datasets import open_dataset
+
+Array = NDArray[np.float64]
+
+CONFIDENCE = 0.9
+RULES: tuple[Rule, ...] = get_args(Rule)
+
+
+def part(seen: Observed, rows: NDArray[np.bool_]) -> Observed:
+    """Return the chosen rows of observations."""
+    return Observed(
+        indices=seen.indices[rows],
+        outputs={name: values[rows] for name, values in seen.outputs.items()},
+        point=seen.point[rows],
+        truth=seen.truth[rows],
+        pose=seen.pose[rows],
+        true_pose=seen.true_pose[rows],
+        sequence=seen.sequence[rows],
+        invalid=0,
+        degraded=0,
+    )
+
+
+def deal_figures(
+    head: Head, cal: Scored, test: Observed, val: Scored, rule: Rule, unit: Array
+) -> dict[str, Array]:
+    """Return the figures of one deal by scope; empty if a threshold is unbounded."""
+    found: dict[str, Array] = {}
+    for entry in thresholds(head, cal, val, rule, "max"):
+        if entry.confidence != CONFIDENCE or None in entry.q_hat:
+            continue
+        sets = test.sets(head, entry)
+        covered = np.array([each.covers(y) for each, y in zip(sets, test.truth, strict=True)])
+        inside = [each.contains(y) for each, y in zip(sets, test.truth, strict=True)]
+        width = np.array([each.width() for each in sets])
+        distance = np.array([each.distance(y) for each, y in zip(sets, test.truth, strict=True)])
+        score = interval_score(width, distance, 1.0 - CONFIDENCE) / unit
+        found[entry.scope] = np.concatenate(
+            [covered.mean(axis=0), width.mean(axis=0), [np.mean(inside), score.mean()]]
+        )
+    return found
+
+
+def main() -> None:
+    """Print the figures of both rules; write them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("bundle", type=Path)
+    parser.add_argument("dataset")
+    parser.add_argument("--deals", type=int, default=300)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    bundle = read_bundle(arguments.bundle)
+    dataset = open_dataset(arguments.dataset)
+    calibration = bundle.calibration
+    roles = same_split(dataset, calibration.calibration.split).roles
+    unit = np.array(calibration.pose.standard_deviation)
+    with Odometer(bundle) as odometer:
+        head = odometer.head
+        seen = observe(odometer, dataset, np.concatenate([roles["cal"], roles["test"]]))
+        val = observe(odometer, dataset, roles["val"]).scored(head)
+    recordings = np.unique(seen.sequence)
+    count = len(np.unique(dataset.sequence[roles["cal"]]))
+    if len(recordings) <= count:
+        raise UsageError(
+            f"{dataset.name}: expected a split by sequence, found {len(recordings)} recordings in "
+            "cal and test"
+        )
+    generator = np.random.default_rng(0)
+    collected: dict[tuple[str, str], list[Array]] = {}
+    for _ in range(arguments.deals):
+        drawn = np.isin(seen.sequence, generator.permutation(recordings)[:count])
+        cal, test = part(seen, drawn).scored(head), part(seen, ~drawn)
+        for rule in RULES:
+            for scope, values in deal_figures(head, cal, test, val, rule, unit).items():
+                collected.setdefault((rule, scope), []).append(values)
+    figures: dict[str, Any] = {}
+    print(f"{arguments.deals} deals: {count} of {len(recordings)} recordings calibrate")
+    for (rule, scope), values in collected.items():
+        mean = np.mean(values, axis=0)
+        figures.setdefault(rule, {})[scope] = {
+            "coverage": mean[:6].tolist(),
+            "mean_width": mean[6:12].tolist(),
+            "joint_coverage": float(mean[12]),
+            "normalised_interval_score": float(mean[13]),
+        }
+        print(
+            f"{rule:<13} {scope:<9} coverage {mean[:6].mean():.3f} (least {mean[:6].min():.3f}), "
+            f"joint {mean[12]:.3f}, width {100 * mean[6:9].mean():.2f} cm "
+            f"{np.rad2deg(mean[9:12].mean()):.2f} deg, score {mean[13]:.3f}"
+        )
+    if arguments.json:
+        report = {"bundle": calibration.name, "deals": arguments.deals, "recordings": count}
+        write_result(arguments.json, {**report, **figures})
+
+
+if __name__ == "__main__":
+    main()
