@@ -25,7 +25,7 @@ from cvo_edge import geometry
 from cvo_edge.bundle.format import Positive, SixPositive
 from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_edge.heads.base import Candidate
-from cvo_edge.heads.scr import ScrHead, ScrParameters
+from cvo_edge.heads.scr import LOST, ScrHead, ScrParameters
 from cvo_edge.pose import Chart
 from cvo_edge.pose_solver import Solution
 
@@ -37,6 +37,9 @@ _SHARES = (0.0, 0.1, 0.3, 1.0)
 # Relative difference of focal lengths up to which two cameras are the same.
 _SAME_FOCAL = 0.01
 _MEDIAN_CHI2_6 = 5.348
+# The limit of the disagreement over the largest of the known frames: a new recording has frames
+# that are a little harder.
+_DISAGREEMENT_MARGIN = 1.3
 
 
 class Fusion(Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,11 +58,13 @@ class FusedParameters(ScrParameters, frozen=True, forbid_unknown_fields=True, kw
     """``method_parameters`` of a fused bundle: those of SCR and the weights.
 
     ``focal_px``: focal length, in pixels of the model's input, of the camera that the regression
-    has learned. ``fusion`` null uses the solver alone.
+    has learned. ``fusion`` null uses the solver alone. ``disagreement_limit``: frames whose two
+    poses differ by more get no interval; null accepts every frame.
     """
 
     focal_px: Positive
     fusion: Fusion | None
+    disagreement_limit: Positive | None
 
 
 class FusedHead(ScrHead):
@@ -76,17 +81,28 @@ class FusedHead(ScrHead):
     def combined(
         self, outputs: Mapping[str, NDArray[Any]], found: Solution, focal_px: float
     ) -> tuple[Array, Array, dict[str, Array]]:
-        """As ``ScrHead``: the fused pose; adds the solver's information ``solved`` (1, 6, 6)."""
+        """As ``ScrHead``: the fused pose.
+
+        Adds the solver's information ``solved`` (1, 6, 6) and, where both poses are used, their
+        ``disagreement`` (1, 1).
+        """
         added = {"solved": found.information[np.newaxis]}
         fusion, own = self.parameters.fusion, self.parameters.focal_px
         if fusion is None or fusion.share == 0.0 or abs(focal_px / own - 1.0) > _SAME_FOCAL:
             return found.pose, found.information, added
         regression = np.asarray(outputs["regression"][0], np.float64)
         regression[3:] = geometry.quaternion_normalise(regression[3:])
-        pose, information = fused(
+        pose, information, disagreement = fused(
             found.pose, found.information, regression, outputs["half_width"][0], fusion
         )
-        return pose, information, added
+        return pose, information, {**added, "disagreement": np.array([[disagreement]])}
+
+    def doubted(self, added: Mapping[str, Array]) -> bool:
+        """As ``ScrHead``: the two poses differ more than those of any known frame."""
+        limit = self.parameters.disagreement_limit
+        if limit is None or "disagreement" not in added:
+            return False
+        return bool(added["disagreement"][0, 0] > limit)
 
     def tuned(
         self,
@@ -112,11 +128,23 @@ class FusedHead(ScrHead):
             for fusion in choices
         ]
         fusion = choices[int(np.argmin(scores))]
-        return replace(self.parameters, limits=limits, camera_limits=camera_limits, fusion=fusion)
+        return replace(
+            self.parameters,
+            limits=limits,
+            camera_limits=camera_limits,
+            fusion=fusion,
+            disagreement_limit=_disagreement_limit(known, fusion),
+        )
 
     def candidates(self) -> tuple[Candidate, ...]:
         """As ``ScrHead``; other data need other weights."""
-        parameters = replace(self.parameters, limits=None, camera_limits=None, fusion=None)
+        parameters = replace(
+            self.parameters,
+            limits=None,
+            camera_limits=None,
+            fusion=None,
+            disagreement_limit=None,
+        )
         return (Candidate(self.score, parameters),)
 
 
@@ -126,10 +154,11 @@ def fused(
     regression: Array,
     half_width: NDArray[Any],
     fusion: Fusion,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, float]:
     """Solved pose (7,) and information (6, 6), regressed pose (7,) and half-widths (6,) -> fused.
 
-    Returns the pose (7,) and its information (6, 6), m and rad.
+    Returns the pose (7,), its information (6, 6), m and rad, and the disagreement: the squared
+    distances of both poses from the fused one in deviations, over six.
     """
     H = fusion.kappa * information
     D = fusion.share / np.square(np.array(fusion.rho) * np.maximum(half_width, 1e-12))
@@ -144,7 +173,23 @@ def fused(
             geometry.quaternion_multiply(solved[3:], geometry.quaternion_exp(step[3:])),
         ]
     )
-    return pose, total / max(1.0, disagreement)
+    return pose, total / max(1.0, disagreement), disagreement
+
+
+def _disagreement_limit(known: Mapping[str, NDArray[Any]], fusion: Fusion) -> float | None:
+    """Return the limit of the disagreement, a margin beyond the largest of the located frames."""
+    located = known["signs"][:, 1] <= LOST
+    if fusion.share == 0.0 or not located.any():
+        return None
+    regression = np.asarray(known["regression"][located], np.float64)
+    regression[:, 3:] = geometry.quaternion_normalise(regression[:, 3:])
+    frames = (known["solved_pose"], known["solved"], known["half_width"])
+    solved, information, half_width = (values[located] for values in frames)
+    found = [
+        fused(*frame, fusion)[2]
+        for frame in zip(solved, information, regression, half_width, strict=True)
+    ]
+    return _DISAGREEMENT_MARGIN * max(found)
 
 
 def _offset(poses: Array, origins: Array) -> Array:

@@ -56,7 +56,7 @@ _MARGIN_ERROR, _MARGIN_CONTRADICTING = 1.3, 0.05
 _LEAST_ERROR_PX = 0.1
 # Where most of the best cells contradict the pose, a frame is lost, even if it was calibrated on:
 # frames between the trained ones may show parts of the place that no trained frame shows.
-_LOST = 0.5
+LOST = 0.5
 
 
 class Signs(Struct, frozen=True, forbid_unknown_fields=True):
@@ -153,9 +153,13 @@ class ScrHead(Head):
                 "lens_gradient": lens.gradient[np.newaxis],
                 "lens_information": lens.information[np.newaxis],
             }
-            strange = not found.last_step < _CONVERGED or (
-                limits is not None
-                and (error_px > limits.error_px or contradicting > limits.contradicting)
+            strange = (
+                not found.last_step < _CONVERGED
+                or (
+                    limits is not None
+                    and (error_px > limits.error_px or contradicting > limits.contradicting)
+                )
+                or self.doubted(added)
             )
             return Solved(solved, Reason.IMAGE_UNFAMILIAR if strange else None)
 
@@ -188,6 +192,10 @@ class ScrHead(Head):
         """
         return found.pose, found.information, {}
 
+    def doubted(self, added: Mapping[str, Array]) -> bool:
+        """Return whether what ``combined`` added speaks against the frame; by default, no."""
+        return False
+
     def tuned(
         self,
         val: Mapping[str, NDArray[Any]],
@@ -200,11 +208,11 @@ class ScrHead(Head):
         Frames that are lost have no part in the limits.
         """
         signs = known["signs"]
-        located = signs[:, 1] <= _LOST
+        located = signs[:, 1] <= LOST
         error_px, contradicting = signs[located].max(axis=0, initial=0.0).tolist()
         limits = Signs(
             max(error_px, _LEAST_ERROR_PX) * _MARGIN_ERROR,
-            min(_LOST, contradicting + _MARGIN_CONTRADICTING),
+            min(LOST, contradicting + _MARGIN_CONTRADICTING),
         )
         camera_limits = fitted_limits(known, sequence)
         return replace(self.parameters, limits=limits, camera_limits=camera_limits)

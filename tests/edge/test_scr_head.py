@@ -149,6 +149,7 @@ FUSED = FusedParameters(
     **{name: getattr(PARAMETERS, name) for name in PARAMETERS.__struct_fields__},
     focal_px=585.0 * 0.4,
     fusion=None,
+    disagreement_limit=None,
 )
 
 
@@ -212,6 +213,18 @@ def test_the_regression_is_left_out_with_another_focal_length():
     assert np.abs(error(truth, found)).max() < 0.02
 
 
+def test_disagreement_beyond_that_of_known_frames_is_a_doubt():
+    generator = np.random.default_rng(6)
+    deviation = np.array([0.005, 0.005, 0.005, 0.002, 0.002, 0.002])
+    val, truths, frames = fused_frames(generator, 100, deviation)
+    tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val, np.arange(100))
+    solve = FusedHead(tuned, "normalised").solver(CAMERA, INPUTS)
+    assert all(solve(frame).doubt is None for frame in frames)
+    for frame in frames:
+        frame["regression"] = frame["regression"] + np.float32([0.3, 0, 0, 0, 0, 0, 0])
+        assert solve(frame).doubt is Reason.IMAGE_UNFAMILIAR
+
+
 def test_disagreement_widens_the_covariance():
     solved = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     fusion = Fusion(kappa=1.0, rho=(1.0,) * 6, share=1.0)
@@ -219,9 +232,13 @@ def test_disagreement_widens_the_covariance():
     for offset in (0.0, 0.1, 1.0):
         regression = solved.copy()
         regression[0] = offset
-        pose, information = fused(solved, 1e4 * np.eye(6), regression, np.full(6, 0.01), fusion)
+        pose, information, disagreement = fused(
+            solved, 1e4 * np.eye(6), regression, np.full(6, 0.01), fusion
+        )
         assert pose[0] == pytest.approx(offset / 2)
         variances.append(np.linalg.inv(information)[0, 0])
+        # Each pose is half the offset away, over deviations of 1 cm.
+        assert disagreement == pytest.approx(2 * (offset / 2 / 0.01) ** 2 / 6)
     assert variances[0] == pytest.approx(0.5e-4)
     assert variances[0] < variances[1] < variances[2]
 

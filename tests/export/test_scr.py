@@ -62,7 +62,7 @@ def _short_regression():
 def every_frame_accepted():
     """The short runs have learned too little to locate a frame."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scr_module, "_LOST", 1.0)
+        patch.setattr(scr_module, "LOST", 1.0)
         patch.setattr(scr_module, "_CONVERGED", np.inf)
         yield
 

@@ -104,7 +104,9 @@ class FusedHead(ExportedHead):
         """Return the only score."""
         alone = self.scr.candidates()[0].parameters
         fields = {name: getattr(alone, name) for name in alone.__struct_fields__}
-        parameters = FusedParameters(**fields, focal_px=float(self.focal_px), fusion=None)
+        parameters = FusedParameters(
+            **fields, focal_px=float(self.focal_px), fusion=None, disagreement_limit=None
+        )
         return (Candidate("normalised", parameters),)
 
 
