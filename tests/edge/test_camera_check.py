@@ -80,7 +80,7 @@ def test_evidence_is_the_derivative_of_the_profiled_likelihood():
     )
     second = 2.0 * at - np.array(up) - np.array(down)
     # The image's own curvature is left out, as in every Gauss-Newton method.
-    np.testing.assert_allclose(np.diag(evidence.information) * h * h, second, rtol=0.1)
+    np.testing.assert_allclose(np.diag(evidence.information) * h * h, second, rtol=0.05)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 from cvo_edge import geometry
 from cvo_edge.camera import Camera, cell_centres
 from cvo_edge.pose import Chart
-from cvo_edge.pose_solver import NU, PoseSolver
+from cvo_edge.pose_solver import NU, PoseSolver, _quaternion
 
 CAMERA = Camera(width=256, height=192, fx=234.0, fy=234.0, cx=127.5, cy=95.5)
 RAYS = CAMERA.rays(cell_centres(192, 256, (12, 16)))
@@ -134,3 +134,13 @@ def test_senseless_points_still_give_a_finite_answer(value):
     assert np.isfinite(found.pose).all()
     assert np.isfinite(found.information).all()
     assert (np.linalg.eigvalsh(found.information) > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    "turn", [(0.1, 0.2, 0.3), (3.1, 0.1, 0.1), (0.1, 3.1, 0.1), (0.1, 0.1, 3.1)]
+)
+def test_one_quaternion_is_that_of_the_vectorised_form(turn):
+    q = geometry.quaternion_exp(np.array(turn))
+    R = geometry.quaternion_to_matrix(q)
+    found = _quaternion(*R.ravel().tolist())
+    np.testing.assert_allclose(found, geometry.matrix_to_quaternion(R), atol=1e-12)

@@ -84,23 +84,24 @@ def runs(tmp_path_factory):
     return of
 
 
-def test_a_finished_run_is_read_back_and_publishes_the_same_bundle(runs, tmp_path):
-    folder, run, bundle = runs("fused")
+@pytest.mark.parametrize("method", list(CONFIGS))
+def test_a_finished_run_is_read_back_and_publishes_the_same_bundle(runs, method, tmp_path):
+    folder, run, bundle = runs(method)
     again = load_run(folder)
     assert same_weights(run, again)
     with every_frame_accepted():
-        publish(again, tmp_path / "again", "fused")
+        publish(again, tmp_path / "again", method)
     first, second = read_bundle(bundle), read_bundle(tmp_path / "again")
     assert second.calibration.thresholds == first.calibration.thresholds
     assert second.calibration.method_parameters == first.calibration.method_parameters
 
 
-@pytest.mark.parametrize("stage", ["map", "training"])
+@pytest.mark.parametrize("stage", ["map", "features", "training"])
 def test_an_interrupted_run_ends_as_if_it_never_was(runs, stage, tmp_path):
     _, run, _ = runs("scr")
     # This interrupts the second lesson.
     first = sum(entry.lesson == "scr-cells" for entry in run.history)
-    calls = {"map": 20, "training": first + 5}[stage]
+    calls = {"map": 20, "features": 1, "training": first + 5}[stage]
     with pytest.raises(InterruptedTrainingError):
         train(tmp_path / "run", config("scr"), stopping_after(calls, stage))
     resumed = train(tmp_path / "run", config("scr"), ignore_progress)
