@@ -32,6 +32,9 @@ _KEPT = 64
 # be a poor measure: one badly known recording would switch the check off. Distortion is less
 # certain, as only the corners of an image show it.
 _FOCAL_MARGIN, _DISTORTION_MARGIN = 3.5, 6.0
+# Limits of a camera that the network has not learned are wider by a factor: its cells err more, and
+# a narrower image tells focal length from distance less well.
+_OTHER = 2.0
 # The least distinct directions keep an estimate of what the frames leave open near zero.
 _PRIOR = 1e-6
 
@@ -69,13 +72,22 @@ class CameraCheck:
     error_px
         Median reprojection error of the known place: a camera is only reported if it explains the
         frames that well.
+    learned
+        Whether the network has learned the stated camera.
     """
 
     def __init__(
-        self, solver: PoseSolver, focal_px: float, limits: LensLimits, error_px: float
+        self,
+        solver: PoseSolver,
+        focal_px: float,
+        limits: LensLimits,
+        error_px: float,
+        *,
+        learned: bool = True,
     ) -> None:
         self._solver, self._focal_px, self._error_px = solver, focal_px, error_px
-        self._limits = np.array([limits.log_focal, limits.log_focal, limits.distortion])
+        values = np.array([limits.log_focal, limits.log_focal, limits.distortion])
+        self._limits = values if learned else _OTHER * values
         self._clear: deque[tuple[Array, Array]] = deque(maxlen=WINDOW)
         self._familiar: deque[tuple[Array, Array]] = deque(maxlen=WINDOW)
         self._kept: list[tuple[Array, Array, Array]] = []

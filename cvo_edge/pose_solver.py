@@ -73,12 +73,17 @@ class PoseSolver:
         Shape (k, 7): poses to start from; a frame starts from the one that fits it best.
     damping
         Shape (6,): deviation, m and rad, far beyond which no step goes.
+
+    Attributes
+    ----------
+    seen
+        Shape (n,): which cells have a ray.
     """
 
     def __init__(self, rays: Array, starts: Array, damping: Array) -> None:
-        seen = np.asarray(np.isfinite(rays).all(axis=1))
-        self._seen = None if seen.all() else seen
-        self._rays = np.ascontiguousarray(np.where(seen[:, np.newaxis], rays, 0.0).T)
+        self.seen = np.asarray(np.isfinite(rays).all(axis=1))
+        self._whole = bool(self.seen.all())
+        self._rays = np.ascontiguousarray(np.where(self.seen[:, np.newaxis], rays, 0.0).T)
         self._R = geometry.quaternion_to_matrix(starts[:, 3:])
         self._t = np.ascontiguousarray(starts[:, :3])
         self._precision = 1.0 / np.square(damping)
@@ -88,8 +93,8 @@ class PoseSolver:
         """World points (n, 3), m, and scales (n,) in normalised coordinates -> solution."""
         X = np.ascontiguousarray(points.T, dtype=np.float64)
         spread = NU * np.square(scale, dtype=np.float64)
-        if self._seen is not None:
-            spread = np.where(self._seen, spread, np.inf)
+        if not self._whole:
+            spread = np.where(self.seen, spread, np.inf)
         R, t = self._start(X, spread)
         for factor in _SMOOTHING:
             R, t, found = self._step(R, t, X, factor * spread, newton=False)
@@ -223,7 +228,7 @@ class PoseSolver:
         error = shown - self._rays
         squared = error[0] * error[0] + error[1] * error[1]
         weight = (NU + 2.0) / (spread + squared)
-        weight *= ahead if self._seen is None else ahead & self._seen
+        weight *= ahead if self._whole else ahead & self.seen
         weighted = full * weight
         rows = weighted.reshape(9, -1)
         hessian = rows @ full.reshape(9, -1).T
@@ -277,6 +282,19 @@ def _distorted(image: Array, lens: Array) -> Array:
 def _moved(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
     """Subtract a step (6,) or longer in the camera frame from a pose."""
     return R @ _rotation(*(-step[3:6]).tolist()), t - R @ step[:3]
+
+
+def dispersion(squared: Array, steps: int) -> float:
+    """Squared errors in units of the scales, (n,) -> the common factor of the squared scales.
+
+    Steps of expectation maximisation from 1 towards the maximum of the likelihood (Lange, Little
+    and Taylor 1989, section 3): where the cells of a frame disagree more than their scales say, the
+    factor exceeds 1, and the pose is less certain.
+    """
+    factor = 1.0
+    for _ in range(steps):
+        factor = float(np.mean(squared * (NU + 2.0) / (NU + squared / factor))) / 2.0
+    return factor
 
 
 class _Step(NamedTuple):

@@ -26,6 +26,7 @@ from cvo_edge.estimate import Reason
 from cvo_edge.heads import Head
 from cvo_edge.input import preprocess
 from cvo_edge.input.frame_checks import Look, image_doubt
+from cvo_edge.input.view import View, crop_view, matched_view, seen_camera
 from cvo_edge.pose import Chart
 
 Array = NDArray[np.float64]
@@ -75,8 +76,10 @@ class Observer:
         The calibration's description of the model, its input and the poses.
     head
         The method, which may need inputs besides the image, and may solve for the pose.
+    learned
+        The camera of the images that the network has learned; None if its intrinsics are unknown.
     camera
-        The camera that takes the images; None if its intrinsics are unknown.
+        The camera that takes the images, by default the learned one.
     threads
         Threads of one inference; all allowed cores by default.
     spinning
@@ -97,6 +100,7 @@ class Observer:
         inputs: PreprocessSpec,
         pose: PoseSpec,
         head: Head,
+        learned: Camera | None = None,
         camera: Camera | None = None,
         *,
         threads: int | None = None,
@@ -107,13 +111,15 @@ class Observer:
             model, threads, spec, spinning=spinning, at_once=at_once
         )
         self._inputs = inputs
-        self._camera = camera
         self._head = head
-        self._solver = head.solver(camera, inputs)
-        # Only a solver depends on the camera's shape.
-        self._shape = None
-        if self._solver is not None and camera is not None:
-            self._shape = camera.height, camera.width
+        self._seen = None
+        self._cameras: tuple[Camera, Camera] | None = None
+        if learned is not None:
+            shape = inputs.height, inputs.width, inputs.crop
+            own = crop_view(learned.height, learned.width, *shape).camera(learned)
+            self._cameras = camera or learned, own
+            self._seen = seen_camera(*self._cameras, inputs.crop)
+        self._solver = head.solver(self._seen)
         reference = None if pose.reference_q_xyzw is None else np.array(pose.reference_q_xyzw)
         absolute = pose.rotation == "tangent_reference"
         self.chart = Chart(pose.rotation, reference if absolute else None)
@@ -166,12 +172,10 @@ class Observer:
         image = preprocess.to_bgr8(image_bgr)
         if image is None:
             return _faulty(Reason.IMAGE_UNSUPPORTED)
-        inputs = self._inputs
-        tensor = preprocess.model_input(image, inputs.height, inputs.width, inputs.crop)
-        look = Look(tensor, (image.shape[0], image.shape[1]))
-        doubt = image_doubt(look)
-        if doubt is None and self._shape is not None and not similar(look.size, self._shape):
-            doubt = Reason.CAMERA_DIFFERS
+        height, width = image.shape[0], image.shape[1]
+        tensor = preprocess.viewed(image, self._view(height, width))[np.newaxis]
+        look = Look(tensor, (height, width))
+        doubt = image_doubt(look) or self._shape_doubt(height, width)
         ready = perf_counter()
         outputs: Mapping[str, NDArray[Any]]
         outputs = session.run({"image": tensor, **self._head.extra_inputs(seq)})
@@ -186,7 +190,23 @@ class Observer:
 
     def camera_check(self) -> CameraCheck | None:
         """Return a check of the camera for a new stream, or None if the method has none."""
-        return self._head.camera_check(self._camera, self._inputs)
+        return self._head.camera_check(self._seen)
+
+    def _view(self, height: int, width: int) -> View:
+        """Return the view of an image, which need not have the size that its camera states."""
+        if self._solver is None or self._cameras is None:
+            inputs = self._inputs
+            return crop_view(height, width, inputs.height, inputs.width, inputs.crop)
+        camera, own = self._cameras
+        return matched_view(camera.scaled(width, height), own, self._inputs.crop)
+
+    def _shape_doubt(self, height: int, width: int) -> Reason | None:
+        """Doubt images of another shape than the camera's; only a solver depends on it."""
+        if self._solver is None or self._cameras is None:
+            return None
+        camera, _ = self._cameras
+        similar_shape = similar((height, width), (camera.height, camera.width))
+        return None if similar_shape else Reason.CAMERA_DIFFERS
 
     def _checked(
         self, outputs: Mapping[str, NDArray[Any]], fault: Reason | None

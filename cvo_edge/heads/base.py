@@ -10,12 +10,12 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import PreprocessSpec, Threshold
-from cvo_edge.camera import Camera
+from cvo_edge.bundle.format import Threshold
 from cvo_edge.camera_check import CameraCheck
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.estimate import Reason
+from cvo_edge.input.view import SeenCamera
 from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import Joint, Scope
 
@@ -97,15 +97,16 @@ class Head(ABC):
         """Return the model inputs besides the image for frame ``seq``; none by default."""
         return {}
 
-    def solver(self, camera: Camera | None, inputs: PreprocessSpec) -> Solver | None:
+    def solver(self, seen: SeenCamera | None) -> Solver | None:
         """Return the function that computes ``pose`` (1, 7) from one frame's model outputs.
 
-        The default is None, for networks that give the pose themselves. ``camera`` is the running
-        camera, None if its intrinsics are unknown. Raises UsageError if the method needs it.
+        The default is None, for networks that give the pose themselves. ``seen`` is None if no
+        intrinsics are known; raises CalibrationFileError if the method needs them, and UsageError
+        if that camera shows the network too little.
         """
         return None
 
-    def camera_check(self, camera: Camera | None, inputs: PreprocessSpec) -> CameraCheck | None:
+    def camera_check(self, seen: SeenCamera | None) -> CameraCheck | None:
         """Return the check of a stream's camera; None by default. Arguments as for ``solver``."""
         return None
 

@@ -8,7 +8,7 @@ H and the regression's half-widths h, both scaled on val, the fused pose minimis
 
 where d is the regression's offset (t_r - t_s, Log(R_s^T R_r)) from the solved pose. Where the two
 disagree by more than their deviations, the covariance grows by the Birge ratio (Birge 1932). The
-network that regresses has learned one camera: with another focal length, it is left out.
+network that regresses has learned one camera: with another one, it is left out.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from cvo_edge.bundle.format import Positive, SixPositive
 from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_edge.heads.base import Candidate
 from cvo_edge.heads.scr import LOST, ScrHead, ScrParameters
+from cvo_edge.input.view import SeenCamera
 from cvo_edge.pose import Chart
 from cvo_edge.pose_solver import Solution
 
@@ -34,8 +35,6 @@ Array = NDArray[np.float64]
 _CHART = Chart("tangent_predicted")
 # Shares of the regression's information that val chooses from.
 _SHARES = (0.0, 0.1, 0.3, 1.0)
-# Relative difference of focal lengths up to which two cameras are the same.
-_SAME_FOCAL = 0.01
 _MEDIAN_CHI2_6 = 5.348
 # The limit of the disagreement over the largest of the known frames: a new recording has frames
 # that are a little harder.
@@ -57,12 +56,10 @@ class Fusion(Struct, frozen=True, forbid_unknown_fields=True):
 class FusedParameters(ScrParameters, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``method_parameters`` of a fused bundle: those of SCR and the weights.
 
-    ``focal_px``: focal length, in pixels of the model's input, of the camera that the regression
-    has learned. ``fusion`` null uses the solver alone. ``disagreement_limit``: frames whose two
-    poses differ by more get no interval; null accepts every frame.
+    ``fusion`` null uses the solver alone. ``disagreement_limit``: frames whose two poses differ by
+    more get no interval; null accepts every frame.
     """
 
-    focal_px: Positive
     fusion: Fusion | None
     disagreement_limit: Positive | None
 
@@ -79,7 +76,7 @@ class FusedHead(ScrHead):
         self.outputs = {**self.outputs, "regression": (1, 7), "half_width": (1, 6)}
 
     def combined(
-        self, outputs: Mapping[str, NDArray[Any]], found: Solution, focal_px: float
+        self, outputs: Mapping[str, NDArray[Any]], found: Solution, seen: SeenCamera
     ) -> tuple[Array, Array, dict[str, Array]]:
         """As ``ScrHead``: the fused pose.
 
@@ -87,8 +84,8 @@ class FusedHead(ScrHead):
         ``disagreement`` (1, 1).
         """
         added = {"solved": found.information[np.newaxis]}
-        fusion, own = self.parameters.fusion, self.parameters.focal_px
-        if fusion is None or fusion.share == 0.0 or abs(focal_px / own - 1.0) > _SAME_FOCAL:
+        fusion = self.parameters.fusion
+        if fusion is None or fusion.share == 0.0 or not seen.learned:
             return found.pose, found.information, added
         regression = np.asarray(outputs["regression"][0], np.float64)
         regression[3:] = geometry.quaternion_normalise(regression[3:])

@@ -9,7 +9,8 @@ nonconformity scores are
     marginal  |e_d| / max(sqrt(C_dd), floor_d)      joint  |L'^-1 e|
 
 where L' is L with its rows enlarged by the same floors. The marginal set is an interval about the
-solved pose; the joint set is an ellipsoid. Frames that agree on a pose get narrow sets.
+solved pose; the joint set is an ellipsoid. Frames that agree on a pose get narrow sets: C grows
+with the disagreement of the cells (``dispersion``).
 
 A frame also tells how far it can be trusted: in a place the network does not know, the cells are
 vague, or disagree on the pose. ``Signs`` holds the limits, from frames of the known place. Over a
@@ -27,16 +28,15 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Number, Positive, PreprocessSpec, SixPositive, Threshold
-from cvo_edge.camera import Camera, cell_centres
+from cvo_edge.bundle.format import Number, Positive, SixPositive, Threshold
 from cvo_edge.camera_check import CameraCheck, LensLimits, fitted_limits
 from cvo_edge.conformal import JointScale, LinearScale
-from cvo_edge.errors import CalibrationFileError
+from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.estimate import Reason
 from cvo_edge.heads.base import Candidate, Head, Solved, Solver
 from cvo_edge.heads.cqr import infinite_where_null, refuse_negative
-from cvo_edge.input.preprocess import input_camera
-from cvo_edge.pose_solver import PoseSolver, Solution
+from cvo_edge.input.view import SeenCamera
+from cvo_edge.pose_solver import PoseSolver, Solution, dispersion
 from cvo_edge.sets import ConformalSet, Ellipsoids, scaled_distance, unbounded_set
 from cvo_edge.vocabulary import Joint, Scope
 
@@ -45,8 +45,13 @@ Seven = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 # Longer last steps of the solver, in deviations, mean that the cells contradict each other.
 _CONVERGED = 0.05
-# The signs look at this many cells of the smallest scale; a part of a known place suffices.
+# Steps of the dispersion for another camera, within a percent of the limit.
+_CONVERGED_STEPS = 20
+# The signs look at this many cells of the smallest scale; a part of a known place suffices. A
+# camera that shows the network fewer cells than usual has fewer of them in the same proportion.
 BEST_CELLS = 100
+# Fewer cells would leave too little to tell a known place from another.
+_LEAST_SEEN = 0.25
 # A cell contradicts the pose if its reprojection error exceeds this many scales.
 _CONTRADICTS = 3.0
 _HAIR = 1e-12
@@ -123,26 +128,32 @@ class ScrHead(Head):
                     f"joint, found {list(entry.q_hat)} at {entry.confidence}"
                 )
 
-    def solver(self, camera: Camera | None, inputs: PreprocessSpec) -> Solver | None:
+    def solver(self, seen: SeenCamera | None) -> Solver | None:
         """As ``Head``: adds ``pose`` (1, 7), ``scale`` (1, 6, 6), ``signs`` (1, 2) and the rest.
 
         ``solved_pose`` (1, 7) is the solver's, which fusion may change; ``lens_gradient`` (1, 3)
         and ``lens_information`` (1, 3, 3) are evidence for the camera check.
         """
-        pose_solver, focal_px = self._pose_solver(camera, inputs)
-        limits = self.parameters.limits
-        count = min(BEST_CELLS, math.prod(self.parameters.grid))
+        seen = _stated(seen)
+        pose_solver, limits = self._pose_solver(seen), self.parameters.limits
+        # The scales that the network predicts have been calibrated for the learned camera only.
+        steps = 1 if seen.learned else _CONVERGED_STEPS
+        focal_px, cells = seen.camera.focal_px, math.prod(self.parameters.grid)
+        count = max(1, round(min(BEST_CELLS, cells) * pose_solver.seen.mean()))
 
         def solve(outputs: Mapping[str, NDArray[Any]]) -> Solved:
             scale_px = np.exp(outputs["log_scale_px"][0].astype(np.float64))
             points, scale = outputs["coordinates"][0], scale_px / focal_px
             found = pose_solver.solve(points, scale)
             lens = pose_solver.lens_evidence(points, scale, found.pose)
-            best = np.argpartition(scale_px, count - 1)[:count]
+            shown = np.where(pose_solver.seen, scale_px, np.inf)
+            best = np.argpartition(shown, count - 1)[:count]
             squared = found.squared[best]
             error_px = math.sqrt(np.median(squared * np.square(scale_px[best])))
             contradicting = np.count_nonzero(squared > _CONTRADICTS**2) / count
-            pose, information, added = self.combined(outputs, found, focal_px)
+            factor = dispersion(found.squared[pose_solver.seen], steps)
+            found = found._replace(information=found.information / factor)
+            pose, information, added = self.combined(outputs, found, seen)
             solved = {
                 **outputs,
                 **added,
@@ -165,31 +176,33 @@ class ScrHead(Head):
 
         return solve
 
-    def camera_check(self, camera: Camera | None, inputs: PreprocessSpec) -> CameraCheck | None:
+    def camera_check(self, seen: SeenCamera | None) -> CameraCheck | None:
         """As ``Head``."""
         limits, signs = self.parameters.camera_limits, self.parameters.limits
         if limits is None or signs is None:
             return None
-        return CameraCheck(*self._pose_solver(camera, inputs), limits, signs.error_px)
+        seen = _stated(seen)
+        solver, focal_px = self._pose_solver(seen), seen.camera.focal_px
+        return CameraCheck(solver, focal_px, limits, signs.error_px, learned=seen.learned)
 
-    def _pose_solver(
-        self, camera: Camera | None, inputs: PreprocessSpec
-    ) -> tuple[PoseSolver, float]:
-        """Return the solver for a camera, and its focal length in pixels of the model's input."""
-        if camera is None:
-            raise CalibrationFileError("camera: expected intrinsics for scr, found null")
-        seen = input_camera(camera, inputs.height, inputs.width, inputs.crop)
-        rays = seen.rays(cell_centres(inputs.height, inputs.width, self.parameters.grid))
-        starts, damping = np.array(self.parameters.starts), np.array(self.parameters.damping)
-        return PoseSolver(rays, starts, damping), seen.focal_px
+    def _pose_solver(self, seen: SeenCamera) -> PoseSolver:
+        rays = seen.rays(self.parameters.grid)
+        solver = PoseSolver(
+            rays, np.array(self.parameters.starts), np.array(self.parameters.damping)
+        )
+        share = float(solver.seen.mean())
+        if share < _LEAST_SEEN:
+            raise UsageError(
+                f"camera: expected images that show at least {_LEAST_SEEN:.0%} of the model's "
+                f"cells, found {share:.0%}; its focal length or distortion is too far from that of "
+                "the bundle's camera"
+            )
+        return solver
 
     def combined(
-        self, outputs: Mapping[str, NDArray[Any]], found: Solution, focal_px: float
+        self, outputs: Mapping[str, NDArray[Any]], found: Solution, seen: SeenCamera
     ) -> tuple[Array, Array, dict[str, Array]]:
-        """Return pose (7,), information (6, 6) and further outputs; by default the solver's.
-
-        ``focal_px`` is the running camera's focal length in pixels of the model's input.
-        """
+        """Return pose (7,), information (6, 6) and further outputs; by default the solver's."""
         return found.pose, found.information, {}
 
     def doubted(self, added: Mapping[str, Array]) -> bool:
@@ -280,6 +293,12 @@ class ScrHead(Head):
         deviation = np.sqrt(np.square(scale).sum(axis=-1))
         floored = np.maximum(deviation, self._floor)
         return scale * (floored / deviation)[..., np.newaxis], floored
+
+
+def _stated(seen: SeenCamera | None) -> SeenCamera:
+    if seen is None:
+        raise CalibrationFileError("camera: expected intrinsics for scr, found null")
+    return seen
 
 
 def _lower_triangular(covariance: Array) -> Array:

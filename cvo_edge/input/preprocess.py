@@ -12,11 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.camera import Camera
+from cvo_edge.input.view import View, crop_view
 from cvo_edge.vocabulary import Crop
 
 Image = NDArray[np.uint8]
-
 
 MIN_SIDE = 16
 
@@ -42,28 +41,6 @@ def to_bgr8(image: object) -> Image | None:
     return image if image.shape[2] == 3 else None
 
 
-def crop_box(
-    image_height: int, image_width: int, height: int, width: int, crop: Crop
-) -> tuple[int, int, int, int]:
-    """Return the part (top, bottom, left, right) of an image that the model sees.
-
-    ``none``: the whole image, stretched to the target's shape; ``centre``: the largest centred part
-    with the aspect ratio of the target height and width.
-    """
-    if crop == "none":
-        return 0, image_height, 0, image_width
-    kept_height = max(1, min(image_height, image_width * height // width))
-    kept_width = max(1, min(image_width, image_height * width // height))
-    top, left = (image_height - kept_height) // 2, (image_width - kept_width) // 2
-    return top, top + kept_height, left, left + kept_width
-
-
-def input_camera(camera: Camera, height: int, width: int, crop: Crop) -> Camera:
-    """Return the camera whose images are the model's inputs, given the one that takes them."""
-    box = crop_box(camera.height, camera.width, height, width, crop)
-    return camera.cropped(*box).scaled(width, height)
-
-
 def halved(image: Image, height: int, width: int) -> Image:
     """Halve by rounded 2x2 means while sides are even and at least twice the target."""
     while (
@@ -78,19 +55,37 @@ def halved(image: Image, height: int, width: int) -> Image:
 
 
 def model_input(image_bgr: Image, height: int, width: int, crop: Crop) -> Image:
-    """Image (any height, any width, 3) BGR -> (1, height, width, 3) RGB, contiguous.
+    """Image (any height, any width, 3) BGR -> (1, height, width, 3) RGB that it fills."""
+    view = crop_view(image_bgr.shape[0], image_bgr.shape[1], height, width, crop)
+    return viewed(image_bgr, view)[np.newaxis]
+
+
+def viewed(image_bgr: Image, view: View) -> Image:
+    """Image (any height, any width, 3) BGR -> what the model sees, (height, width, 3) RGB.
 
     The image is halved as often as possible, then resized by ``INTER_LINEAR_EXACT``.
     """
-    top, bottom, left, right = crop_box(image_bgr.shape[0], image_bgr.shape[1], height, width, crop)
-    image = halved(image_bgr[top:bottom, left:right], height, width)
+    part, place = view.part, view.place
+    image = image_bgr[part.top : part.bottom, part.left : part.right]
+    resized = _resized(image, *place.shape)
+    if place.shape == (view.height, view.width):
+        return resized
+    # The network's padding would be darker than any image.
+    bottom, right = view.height - place.bottom, view.width - place.right
+    edges = place.top, bottom, place.left, right
+    return np.asarray(cv2.copyMakeBorder(resized, *edges, cv2.BORDER_REPLICATE), dtype=np.uint8)
+
+
+def _resized(image: Image, height: int, width: int) -> Image:
+    """Image BGR -> (height, width, 3) RGB, contiguous."""
+    image = halved(image, height, width)
     if image.shape[:2] == (height, width):
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)[np.newaxis]
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
     # OpenCV has vector code for four channels but not for three; the results are identical, and
     # it is faster even with both conversions.
     four = cv2.cvtColor(image, cv2.COLOR_BGR2RGBA)
     four = cv2.resize(four, (width, height), interpolation=cv2.INTER_LINEAR_EXACT)
-    return np.asarray(cv2.cvtColor(four, cv2.COLOR_RGBA2RGB), dtype=np.uint8)[np.newaxis]
+    return np.asarray(cv2.cvtColor(four, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
 
 
 def selftest_image(height: int, width: int) -> Image:

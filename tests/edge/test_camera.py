@@ -7,7 +7,6 @@ import pytest
 
 from cvo_edge.camera import Camera, cell_centres, read_camera
 from cvo_edge.errors import UsageError
-from cvo_edge.input.preprocess import crop_box, input_camera
 
 PINHOLE = Camera(width=640, height=480, fx=585.0, fy=580.0, cx=320.0, cy=240.0)
 RADIAL = msgspec.structs.replace(
@@ -58,19 +57,6 @@ def test_a_pixel_beyond_the_lens_model_has_no_ray():
     rays = steep.rays([[320.0, 240.0], [320.0 + 0.7 * 585.0, 240.0], [320.0 + 0.9 * 585.0, 240.0]])
     assert np.isfinite(rays[:2]).all()
     assert np.isnan(rays[2]).all()
-
-
-@pytest.mark.parametrize("camera", [PINHOLE, RADIAL, FISHEYE])
-@pytest.mark.parametrize("crop", ["none", "centre"])
-def test_the_models_input_shows_the_same_rays(camera, crop):
-    height, width = 192, 240
-    seen = input_camera(camera, height, width, crop)
-    centres = cell_centres(height, width, (12, 15))
-    top, bottom, left, right = crop_box(camera.height, camera.width, height, width, crop)
-    # The same places of the image, in coordinates that begin at the edge of the first pixel.
-    scale = np.array([right - left, bottom - top]) / (width, height)
-    full = (centres + 0.5) * scale - 0.5 + (left, top)
-    np.testing.assert_allclose(seen.rays(centres), camera.rays(full), atol=1e-9)
 
 
 def test_cell_centres_are_the_means_of_their_pixels():

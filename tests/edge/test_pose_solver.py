@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from cvo_edge import geometry
 from cvo_edge.camera import Camera, cell_centres
 from cvo_edge.pose import Chart
-from cvo_edge.pose_solver import NU, PoseSolver, _quaternion
+from cvo_edge.pose_solver import NU, PoseSolver, _quaternion, dispersion
 
 CAMERA = Camera(width=256, height=192, fx=234.0, fy=234.0, cx=127.5, cy=95.5)
 RAYS = CAMERA.rays(cell_centres(192, 256, (12, 16)))
@@ -144,3 +144,21 @@ def test_one_quaternion_is_that_of_the_vectorised_form(turn):
     R = geometry.quaternion_to_matrix(q)
     found = _quaternion(*R.ravel().tolist())
     np.testing.assert_allclose(found, geometry.matrix_to_quaternion(R), atol=1e-12)
+
+
+@pytest.mark.parametrize("factor", [0.25, 1.0, 9.0])
+def test_the_dispersion_is_the_factor_of_the_squared_scales(factor):
+    """Squared radii of Student's t with nu = 3 in two dimensions are 2 F(2, nu) distributed."""
+    squared = factor * 2.0 * np.random.default_rng(0).f(2.0, NU, 100_000)
+    assert dispersion(squared, 60) == pytest.approx(factor, rel=0.03)
+    # One step goes a part of the way, from 1.
+    one = dispersion(squared, 1)
+    assert abs(np.log(one)) < abs(np.log(factor)) + 0.01
+    assert np.log(one) * np.log(factor) >= 0.0
+    of_scipy = minimize_scalar(
+        lambda v: np.log(v) + (NU + 2) / 2 * np.log1p(squared / (NU * v)).mean(),
+        bounds=(0.01, 100.0),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    assert dispersion(squared, 60) == pytest.approx(of_scipy.x, rel=1e-3)

@@ -43,18 +43,6 @@ def test_a_constant_image_stays_constant():
     assert (found == [30, 20, 10]).all()  # RGB of BGR
 
 
-@pytest.mark.parametrize(
-    ("size", "box"),
-    [
-        ((480, 640), (0, 480, 0, 640)),
-        ((480, 800), (0, 480, 80, 720)),
-        ((600, 640), (60, 540, 0, 640)),
-    ],
-)
-def test_centre_crop_is_the_largest_of_the_target_shape(size, box):
-    assert preprocess.crop_box(*size, 192, 256, "centre") == box
-
-
 def test_defined_conversions():
     grey = noise(40, 50, 0)
     np.testing.assert_array_equal(preprocess.to_bgr8(grey), np.repeat(grey[..., None], 3, axis=2))

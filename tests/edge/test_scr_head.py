@@ -5,27 +5,16 @@ import numpy as np
 import pytest
 
 from cvo_edge import geometry
-from cvo_edge.bundle.format import PreprocessSpec, Threshold
-from cvo_edge.camera import Camera, cell_centres
+from cvo_edge.bundle.format import Threshold
+from cvo_edge.camera import Camera
 from cvo_edge.conformal import conformal_quantile
-from cvo_edge.errors import CalibrationFileError
+from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.estimate import Reason
 from cvo_edge.heads.fused import FusedHead, FusedParameters, Fusion, fused
 from cvo_edge.heads.scr import ScrHead, ScrParameters, Signs
-from cvo_edge.input.preprocess import input_camera
+from cvo_edge.input.view import SeenCamera, crop_view, seen_camera
 from cvo_edge.pose import Chart
 
-INPUTS = PreprocessSpec(
-    height=192,
-    width=256,
-    colour_order="rgb",
-    interpolation="halve_then_linear_exact",
-    crop="none",
-    mean=(0.5, 0.5, 0.5),
-    std=(0.5, 0.5, 0.5),
-    layout="nhwc",
-    in_graph=("cast", "transpose", "normalise"),
-)
 CAMERA = Camera(width=640, height=480, fx=585.0, fy=585.0, cx=319.5, cy=239.5)
 FISHEYE = msgspec.structs.replace(
     CAMERA, fx=300.0, fy=300.0, distortion="equidistant", coefficients=(0.01, 0.0, 0.0, 0.0)
@@ -40,6 +29,12 @@ PARAMETERS = ScrParameters(
     camera_limits=None,
 )
 CHART = Chart("tangent_predicted")
+# The network's input, 192 x 256, when it was trained.
+LEARNED = crop_view(480, 640, 192, 256, "none").camera(CAMERA)
+
+
+def seen(camera: Camera) -> SeenCamera:
+    return seen_camera(camera, LEARNED, "none")
 
 
 def pose_near(generator):
@@ -49,9 +44,11 @@ def pose_near(generator):
 
 def outputs_of(camera, pose, generator, noise_px=0.5):
     """What a network would predict for an image that ``camera`` takes at ``pose``."""
-    seen = input_camera(camera, INPUTS.height, INPUTS.width, INPUTS.crop)
-    centres = cell_centres(INPUTS.height, INPUTS.width, GRID)
-    rays = seen.rays(centres + generator.normal(0.0, noise_px, centres.shape))
+    rays = seen(camera).rays(GRID)
+    shown = np.isfinite(rays)
+    # What the network says of other cells is arbitrary.
+    noise = noise_px / seen(camera).camera.focal_px
+    rays = np.where(shown, rays, 0.3) + generator.normal(0.0, noise, rays.shape)
     depth = generator.uniform(1.0, 4.0, (len(rays), 1))
     points = np.column_stack([rays, np.ones(len(rays))]) * depth
     world = points @ geometry.quaternion_to_matrix(pose[3:]).T + pose[:3]
@@ -77,7 +74,7 @@ def error(truth, found):
 )
 def test_any_camera_works_if_it_is_given(camera):
     generator = np.random.default_rng(0)
-    solve = ScrHead(PARAMETERS, "normalised").solver(camera, INPUTS)
+    solve = ScrHead(PARAMETERS, "normalised").solver(seen(camera))
     for _ in range(10):
         truth = pose_near(generator)
         found, doubt = solve(outputs_of(camera, truth, generator))
@@ -88,15 +85,21 @@ def test_any_camera_works_if_it_is_given(camera):
 @pytest.mark.parametrize("other", [CAMERA.zoomed(1.4), FISHEYE])
 def test_another_camera_is_doubted_if_it_is_not_given(other):
     generator = np.random.default_rng(0)
-    solve = ScrHead(PARAMETERS, "normalised").solver(CAMERA, INPUTS)
+    solve = ScrHead(PARAMETERS, "normalised").solver(seen(CAMERA))
     for _ in range(10):
         _, doubt = solve(outputs_of(other, pose_near(generator), generator))
         assert doubt is Reason.IMAGE_UNFAMILIAR
 
 
+def test_a_camera_that_shows_too_little_is_refused():
+    head = ScrHead(PARAMETERS, "normalised")
+    with pytest.raises(UsageError, match="at least 25% of the model's cells, found 12%"):
+        head.solver(seen(CAMERA.zoomed(2.4)))
+
+
 def test_points_of_no_place_are_doubted():
     generator = np.random.default_rng(0)
-    solve = ScrHead(PARAMETERS, "normalised").solver(CAMERA, INPUTS)
+    solve = ScrHead(PARAMETERS, "normalised").solver(seen(CAMERA))
     for scale in (0.3, 3.0, 30.0):
         points = generator.normal(0.0, 2.0, (1, 192, 3)).astype(np.float32)
         logs = np.full((1, 192), np.log(scale), np.float32)
@@ -106,7 +109,7 @@ def test_points_of_no_place_are_doubted():
 
 def test_without_intrinsics_it_is_refused():
     with pytest.raises(CalibrationFileError, match="camera: expected intrinsics for scr, found"):
-        ScrHead(PARAMETERS, "normalised").solver(None, INPUTS)
+        ScrHead(PARAMETERS, "normalised").solver(None)
 
 
 def stacked(frames):
@@ -116,11 +119,11 @@ def stacked(frames):
 def test_limits_accept_every_known_frame():
     generator = np.random.default_rng(0)
     head = ScrHead(msgspec.structs.replace(PARAMETERS, limits=None), "normalised")
-    solve = head.solver(CAMERA, INPUTS)
+    solve = head.solver(seen(CAMERA))
     frames = [outputs_of(CAMERA, pose_near(generator), generator) for _ in range(50)]
     known = stacked([solve(frame).outputs for frame in frames])
     tuned = ScrHead(head.tuned(known, np.empty((0, 7)), known, np.zeros(50, int)), "normalised")
-    again = tuned.solver(CAMERA, INPUTS)
+    again = tuned.solver(seen(CAMERA))
     assert all(again(frame).doubt is None for frame in frames)
     assert tuned.candidates()[0].parameters.limits is None
 
@@ -129,7 +132,7 @@ def test_limits_accept_every_known_frame():
 def test_the_set_holds_exactly_the_poses_with_a_smaller_score(scope):
     generator = np.random.default_rng(1)
     head = ScrHead(PARAMETERS, "normalised")
-    solve = head.solver(CAMERA, INPUTS)
+    solve = head.solver(seen(CAMERA))
     point = np.zeros(6)
     threshold = Threshold(confidence=0.9, scope=scope, q_hat=(2.0,) * 6, q_hat_upper=None)
     for _ in range(50):
@@ -147,7 +150,6 @@ def test_the_set_holds_exactly_the_poses_with_a_smaller_score(scope):
 
 FUSED = FusedParameters(
     **{name: getattr(PARAMETERS, name) for name in PARAMETERS.__struct_fields__},
-    focal_px=585.0 * 0.4,
     fusion=None,
     disagreement_limit=None,
 )
@@ -161,7 +163,7 @@ def regression_of(truth, generator, deviation):
 
 def fused_frames(generator, count, deviation):
     """Outputs of the fused network, with a regression of this deviation, and true poses."""
-    solve = FusedHead(FUSED, "normalised").solver(CAMERA, INPUTS)
+    solve = FusedHead(FUSED, "normalised").solver(seen(CAMERA))
     truths, found = [], []
     for _ in range(count):
         truth = pose_near(generator)
@@ -185,8 +187,8 @@ def test_two_poses_are_better_than_either():
     val, truths, frames = fused_frames(generator, 200, deviation)
     tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val, np.arange(200))
     assert tuned.fusion.share > 0.0
-    together = position_error(FusedHead(tuned, "normalised").solver(CAMERA, INPUTS), frames, truths)
-    solved = position_error(FusedHead(FUSED, "normalised").solver(CAMERA, INPUTS), frames, truths)
+    together = position_error(FusedHead(tuned, "normalised").solver(seen(CAMERA)), frames, truths)
+    solved = position_error(FusedHead(FUSED, "normalised").solver(seen(CAMERA)), frames, truths)
     regressed = np.median(np.linalg.norm(val["regression"][:, :3] - truths[:, :3], axis=1))
     assert together < 0.9 * min(solved, regressed)
 
@@ -195,21 +197,21 @@ def test_a_useless_regression_does_no_harm():
     generator = np.random.default_rng(3)
     val, truths, frames = fused_frames(generator, 200, np.full(6, 0.5))
     tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val, np.arange(200))
-    together = position_error(FusedHead(tuned, "normalised").solver(CAMERA, INPUTS), frames, truths)
-    solved = position_error(FusedHead(FUSED, "normalised").solver(CAMERA, INPUTS), frames, truths)
+    together = position_error(FusedHead(tuned, "normalised").solver(seen(CAMERA)), frames, truths)
+    solved = position_error(FusedHead(FUSED, "normalised").solver(seen(CAMERA)), frames, truths)
     assert together < 1.02 * solved
 
 
-def test_the_regression_is_left_out_with_another_focal_length():
+@pytest.mark.parametrize("other", [CAMERA.zoomed(1.2), CAMERA.cropped(0, 480, 0, 600)])
+def test_the_regression_is_left_out_with_another_camera(other):
     generator = np.random.default_rng(4)
     fusion = Fusion(kappa=1.0, rho=(1e-3,) * 6, share=1.0)
     head = FusedHead(msgspec.structs.replace(FUSED, fusion=fusion), "normalised")
-    other = CAMERA.zoomed(1.2)
     truth = pose_near(generator)
     outputs = outputs_of(other, truth, generator)
     outputs["regression"] = np.array([[9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 1.0]], np.float32)
     outputs["half_width"] = np.full((1, 6), 0.01, np.float32)
-    found = head.solver(other, INPUTS)(outputs).outputs["pose"][0]
+    found = head.solver(seen(other))(outputs).outputs["pose"][0]
     assert np.abs(error(truth, found)).max() < 0.02
 
 
@@ -218,7 +220,7 @@ def test_disagreement_beyond_that_of_known_frames_is_a_doubt():
     deviation = np.array([0.005, 0.005, 0.005, 0.002, 0.002, 0.002])
     val, truths, frames = fused_frames(generator, 100, deviation)
     tuned = FusedHead(FUSED, "normalised").tuned(val, truths, val, np.arange(100))
-    solve = FusedHead(tuned, "normalised").solver(CAMERA, INPUTS)
+    solve = FusedHead(tuned, "normalised").solver(seen(CAMERA))
     assert all(solve(frame).doubt is None for frame in frames)
     for frame in frames:
         frame["regression"] = frame["regression"] + np.float32([0.3, 0, 0, 0, 0, 0, 0])
@@ -246,7 +248,7 @@ def test_disagreement_widens_the_covariance():
 def test_coverage_of_exchangeable_frames():
     generator = np.random.default_rng(5)
     head = ScrHead(msgspec.structs.replace(PARAMETERS, limits=None), "normalised")
-    solve = head.solver(CAMERA, INPUTS)
+    solve = head.solver(seen(CAMERA))
     scores = []
     for _ in range(600):
         truth = pose_near(generator)

@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 
+import cv2
 import numpy as np
 import onnx
 import pytest
@@ -130,6 +131,34 @@ def test_a_bundle_locates_the_camera_and_covers_it(learned):
         level = find_level(report["levels"], 0.9, scope)
         covered = level["coverage"] if scope == "marginal" else [level["joint_coverage"]]
         assert min(covered) > 0.7
+
+
+def test_a_camera_of_another_focal_length_works_if_it_is_given(learned):
+    run, bundle = learned
+    own = run.dataset.camera()
+    box = own.height // 20, own.height - own.height // 20, 5, own.width - 11
+    other = own.cropped(*box).scaled(400, 300)
+
+    def cropped(image):
+        top, bottom, left, right = box
+        return cv2.resize(image[top:bottom, left:right], (400, 300), interpolation=cv2.INTER_AREA)
+
+    def errors(camera, change):
+        with Odometer.load(bundle, camera=camera) as odometer:
+            found = [
+                (
+                    odometer.step(change(run.dataset.read_image(int(index)))),
+                    run.dataset.poses[index],
+                )
+                for index in run.split.roles["test"]
+            ]
+        known = [(each, pose) for each, pose in found if each.bounded]
+        assert len(known) > 0.8 * len(found)
+        assert np.mean([each.covers(pose) for each, pose in known]) > 0.75
+        return [np.linalg.norm(each.pose.t_m - pose[:3]) for each, pose in known]
+
+    # Nine cells of ten are left at most, on each side.
+    assert np.median(errors(other, cropped)) < 2.5 * np.median(errors(None, lambda image: image))
 
 
 def test_the_runtime_solves_for_the_pose_of_torchs_coordinates(runs):

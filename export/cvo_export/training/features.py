@@ -23,6 +23,7 @@ from cvo_edge.engine.session import Session
 from cvo_edge.errors import SourceError
 from cvo_edge.files import whole_file
 from cvo_edge.input import preprocess
+from cvo_edge.input.view import crop_view
 from cvo_edge.vocabulary import Crop
 from cvo_export.data.augment import AugmentConfig, augmented
 from cvo_export.datasets import PoseDataset
@@ -50,7 +51,8 @@ class ModelImages:
         # The camera whose images these are, or None.
         self.camera = None
         if camera is not None:
-            self.camera = preprocess.input_camera(camera, height, width, crop)
+            view = crop_view(camera.height, camera.width, height, width, crop)
+            self.camera = view.camera(camera)
         for row, index in enumerate(indices.tolist()):
             image = preprocess.to_bgr8(dataset.read_image(index))
             if image is None:

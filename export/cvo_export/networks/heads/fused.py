@@ -72,15 +72,11 @@ class FusedHead(ExportedHead):
     runtime_method = "fused"
     rotation = "tangent_predicted"
 
-    def __init__(
-        self, scr: ScrHead, regression: CjpNetwork, setting: Setting, focal_px: float
-    ) -> None:
+    def __init__(self, scr: ScrHead, regression: CjpNetwork, setting: Setting) -> None:
         super().__init__()
         self.scr, self.regression = scr, regression
         self.pooled = Pooled(scr.upper.shape)
         self.decoder = PoseDecoder(setting.target)
-        self.register_buffer("focal_px", torch.tensor(focal_px, dtype=torch.float64))
-        self.focal_px: Tensor
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return coordinates, log scales, regressed pose and half-widths, m and rad."""
@@ -104,9 +100,7 @@ class FusedHead(ExportedHead):
         """Return the only score."""
         alone = self.scr.candidates()[0].parameters
         fields = {name: getattr(alone, name) for name in alone.__struct_fields__}
-        parameters = FusedParameters(
-            **fields, focal_px=float(self.focal_px), fusion=None, disagreement_limit=None
-        )
+        parameters = FusedParameters(**fields, fusion=None, disagreement_limit=None)
         return (Candidate("normalised", parameters),)
 
 
@@ -141,7 +135,7 @@ def _train(lessons: Lessons, config: FusedConfig) -> FusedHead:
         schedule=Schedule(_REGRESSION_STEPS, 64, 1e-3),
         candidate=False,
     )
-    return FusedHead(scr, learner.network, lessons.setting, place.focal_px)
+    return FusedHead(scr, learner.network, lessons.setting)
 
 
 def _features(upper: Upper, pooled: Pooled, maps: NDArray[Any]) -> NDArray[np.float16]:
@@ -155,7 +149,7 @@ def _restore(setting: Setting, config: FusedConfig, state: Mapping[str, Tensor])
     own = {name.removeprefix("scr."): v for name, v in state.items() if name.startswith("scr.")}
     scr = restored_scr(setting, config, own)
     size = Pooled(scr.upper.shape).size
-    head = FusedHead(scr, CjpNetwork(size, _REGRESSION), setting, float(state["focal_px"]))
+    head = FusedHead(scr, CjpNetwork(size, _REGRESSION), setting)
     head.load_state_dict(state)
     return head
 
