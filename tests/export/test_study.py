@@ -106,6 +106,21 @@ def test_a_noise_that_is_new_is_evaluated_without_training(studied, monkeypatch,
     assert folder.cell(name).read_bytes() == before
 
 
+def test_a_cell_that_is_made_again_keeps_its_training_time(studied, monkeypatch, tmp_path):
+    known, _, results, _, _ = studied
+    folder = CellFolder(shutil.copytree(known.out, tmp_path / "out"), known.features)
+    monkeypatch.setenv("CVO_TEST_DATA", DATASET)
+    name = results.places[0].cell
+    folder.cell(name).unlink()
+    shutil.rmtree(folder.bundle(name))
+    (tmp_path / "study.toml").write_text(CONFIG)
+    study = read_study(tmp_path / "study.toml")
+    again = run_study(study, folder, engine, ignore_progress, [].append).cells[name]
+    assert again.training is not None
+    assert again.training == results.cells[name].training
+    assert again.bundle == results.cells[name].bundle
+
+
 def test_cells_of_other_data_are_refused(studied, monkeypatch):
     folder, study, _, _, _ = studied
     monkeypatch.setenv("CVO_TEST_DATA", DATASET.replace("flights=", "seed=7,flights="))

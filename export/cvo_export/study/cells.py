@@ -36,6 +36,8 @@ from cvo_export.training.run import TrainConfig
 
 Say = Callable[[str], None]
 
+_SECONDS_FILE = "training-seconds.json"
+
 
 @dataclass(frozen=True)
 class CellFolder:
@@ -230,7 +232,11 @@ def _finished(folder: CellFolder, name: str, config: TrainConfig) -> Cell:
     interrupted = any(run_dir.glob("checkpoint-*"))
     clock = _Clock()
     run = train(run_dir, config, clock, folder.features)
-    seconds = clock.seconds()
+    # Kept with the run, so that a bundle that is published again keeps them.
+    kept = run_dir / _SECONDS_FILE
+    if not interrupted:
+        write_json(kept, clock.seconds())
+    seconds = read_json(kept, Seconds, "training times") if kept.is_file() else None
     calibration = publish(run, bundle, name, rule="pooled")
     report = evaluate(bundle, run.dataset, "test", threads=1)
     marginal = find_level(report["levels"], CONFIDENCE, "marginal")
@@ -248,7 +254,7 @@ def _finished(folder: CellFolder, name: str, config: TrainConfig) -> Cell:
         own=None if report["own"] is None else Figures.of(report["own"]),
         joint_volume=joint["joint_volume"],
         point_error=report["point_error"],
-        training=None if interrupted else seconds,
+        training=seconds,
         head_parameters=_parameters(run.graph.head),
         graph_parameters=_parameters(run.graph),
         model_bytes=(bundle / calibration.model.file).stat().st_size,
