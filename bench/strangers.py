@@ -110,7 +110,6 @@ def turned_90(image: Image) -> Image:
 
 
 ALTERED: dict[str, Change] = {
-    "as it is": lambda image: image,
     "mirrored": lambda image: image[:, ::-1],
     "upside down": lambda image: image[::-1],
     "turned by 90 degrees": turned_90,
@@ -169,8 +168,9 @@ def cropped(own: Camera, share: float, scale: float) -> tuple[Camera, Change]:
     return camera, change
 
 
-# Share of the sides, and scale of what is left.
+# Share of the sides, and scale of what is left; the first changes nothing.
 STATED = {
+    "as it is": (1.0, 1.0),
     "half the pixels of each side": (1.0, 0.5),
     "cut to 0.9": (0.9, 1.0),
     "cut to 0.8, scaled by 1.25": (0.8, 1.25),

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import accuracy_tables
 import comparison_tables
+import localiser_tables
 import speed_tables
 import study_tables
 from goals import goals_table
@@ -43,6 +44,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **accuracy_tables.TABLES,
     **comparison_tables.TABLES,
     **study_tables.TABLES,
+    **localiser_tables.TABLES,
     **speed_tables.TABLES,
     "faults": faults,
     "goals": goals_table,

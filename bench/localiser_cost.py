@@ -1,0 +1,141 @@
+"""What scene coordinates cost: a frame, the solver, memory and file, beside CJP in float32.
+
+    python bench/localiser_cost.py [--json FILE]
+
+Demonstration bundles of CJP and SCR, in float32 and 8 bits, on frames of 640x480. A frame is the
+time from an image array to its interval; all four bundles take turns, on one thread and on two.
+The solver is what the runtime does between the network's outputs and the pose, with covariance,
+self-check and evidence for the camera check; ``solve`` is the pose and its information alone. Peak
+memory is that of a process that loads the bundle and steps through fifty frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from networks import PRECISIONS, demonstration, frames, images
+from provenance import write_result
+from rounds import figures, interleaved, ratio
+
+from cvo_edge.engine.loading import read_bundle
+from cvo_edge.heads.scr import ScrHead
+from cvo_edge.input.view import crop_view, seen_camera
+from cvo_edge.odometer import Odometer
+from cvo_edge.pose_solver import PoseSolver
+
+BUNDLES = {
+    f"{method} {precision}": demonstration(method, precision)
+    for method in ("cjp", "scr")
+    for precision in PRECISIONS
+}
+REFERENCE = "cjp fp32"
+ROUNDS, WARM_UP, CALLS = 300, 20, 500
+_STEP = """
+import sys
+import cv2
+from cvo_edge import Odometer
+from cvo_edge.programs.measure import memory_mib
+
+with Odometer.load(sys.argv[1], threads=2) as odometer:
+    for path in sys.argv[2:]:
+        odometer.step(cv2.imread(path))
+    print(memory_mib()["peak_rss"])
+"""
+
+
+def frame_ms(threads: int) -> dict[str, dict[str, Any]]:
+    """Time frames of all bundles in turn."""
+    pictures = images()
+    odometers = {
+        name: Odometer(read_bundle(path), threads=threads) for name, path in BUNDLES.items()
+    }
+    kept = np.empty_like(pictures[0])
+    ms = interleaved(
+        {name: lambda _, one=one: one.step(kept) for name, one in odometers.items()},
+        rounds=ROUNDS,
+        warmup=WARM_UP,
+        before={
+            name: lambda number: np.copyto(kept, pictures[number % len(pictures)])
+            for name in odometers
+        },
+    )
+    return {
+        name: {"ms": figures(spent), "over_reference": ratio(spent, ms[REFERENCE])}
+        for name, spent in ms.items()
+    }
+
+
+def solver_ms() -> dict[str, float]:
+    """Time the solver on outputs of the network."""
+    bundle = read_bundle(BUNDLES["scr fp32"])
+    calibration, head = bundle.calibration, bundle.head
+    camera, inputs = calibration.camera, calibration.preprocess
+    if not isinstance(head, ScrHead) or camera is None:
+        raise SystemExit("expected a bundle of scr, found another one")
+    shape = inputs.height, inputs.width, inputs.crop
+    own = crop_view(camera.height, camera.width, *shape).camera(camera)
+    seen = seen_camera(camera, own, inputs.crop)
+    whole = head.solver(seen)
+    parameters = head.parameters
+    alone = PoseSolver(
+        seen.rays(parameters.grid), np.array(parameters.starts), np.array(parameters.damping)
+    )
+    with Odometer(bundle, threads=1) as odometer:
+        outputs = [dict(odometer.observe(picture, 0).outputs) for picture in images()]
+    scales = [np.exp(each["log_scale_px"][0].astype(float)) / own.focal_px for each in outputs]
+    spent: dict[str, list[float]] = {"solve": [], "solver": []}
+    for number in range(CALLS):
+        each = number % len(outputs)
+        begin = perf_counter()
+        alone.solve(outputs[each]["coordinates"][0], scales[each])
+        middle = perf_counter()
+        whole(outputs[each])
+        spent["solve"].append(1e3 * (middle - begin))
+        spent["solver"].append(1e3 * (perf_counter() - middle))
+    return {name: float(np.median(values)) for name, values in spent.items()}
+
+
+def peak_mib(bundle: Path) -> float:
+    """Peak memory of a process that steps through all frames."""
+    command = [sys.executable, "-c", _STEP, str(bundle), *map(str, frames())]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def main() -> None:
+    """Print the figures; write them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    times = {threads: frame_ms(threads) for threads in (1, 2)}
+    report: dict[str, Any] = {"solver_ms": solver_ms(), "bundles": {}}
+    for name, path in BUNDLES.items():
+        model = read_bundle(path).calibration.model.file
+        found = {
+            "frame": {str(threads): times[threads][name] for threads in times},
+            "peak_mib": peak_mib(path),
+            "model_bytes": (path / model).stat().st_size,
+        }
+        report["bundles"][name] = found
+        per_thread = ", ".join(
+            f"{threads} threads {found['frame'][str(threads)]['ms']['median']:.2f} ms "
+            f"({found['frame'][str(threads)]['over_reference']['median']:.3f} x)"
+            for threads in times
+        )
+        print(
+            f"{name:<9} {per_thread}, peak {found['peak_mib']:.0f} MiB, file "
+            f"{found['model_bytes'] / 1e6:.2f} MB"
+        )
+    solve, solver = report["solver_ms"]["solve"], report["solver_ms"]["solver"]
+    print(f"solver    {solve:.2f} ms, with covariance, self-check and camera {solver:.2f} ms")
+    if arguments.json:
+        write_result(arguments.json, report)
+
+
+if __name__ == "__main__":
+    main()
