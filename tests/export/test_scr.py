@@ -10,7 +10,7 @@ import torch
 
 from cvo_edge import Odometer
 from cvo_edge.engine.loading import read_bundle
-from cvo_edge.errors import UsageError
+from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.heads import scr as scr_module
 from cvo_edge.heads.scr import ScrParameters
 from cvo_edge.pose_solver import NU
@@ -21,10 +21,13 @@ from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import evaluate, find_level
 from cvo_export.networks.backbone import BackboneConfig
 from cvo_export.networks.heads import fused as fused_module
+from cvo_export.networks.heads.base import deviation_of
 from cvo_export.networks.heads.fused import FusedConfig
 from cvo_export.networks.heads.scr import ScrConfig, cell_loss, spread_poses
+from cvo_export.networks.methods import TRAINABLE
 from cvo_export.networks.stem import split_backbone
 from cvo_export.publish import publish
+from cvo_export.training.configure import _copies
 from cvo_export.training.loop import train
 from cvo_export.training.run import load_run
 
@@ -265,3 +268,24 @@ def test_spread_poses_cover_all_poses():
         for n in (1, 16)
     )
     assert many < 0.6 * few
+
+
+def test_a_network_that_recognises_nothing_is_not_published(runs, tmp_path):
+    _, run, _ = runs("scr")
+    with pytest.raises(SourceError, match=r"found none of \d+: image_unfamiliar \d+$"):
+        publish(run, tmp_path / "bundle", "lost")
+    assert not (tmp_path / "bundle").exists()
+
+
+@pytest.mark.parametrize(("frames", "copies"), [(100, 16), (2400, 16), (10_000, 7), (500_000, 1)])
+def test_large_data_sets_get_fewer_copies(monkeypatch, frames, copies):
+    monkeypatch.setattr("cvo_export.training.configure.open_dataset", lambda _: range(frames))
+    assert _copies(TRAINABLE["scr"], "any") == copies
+    assert _copies(TRAINABLE["cjp"], "any") == 48
+
+
+@pytest.mark.parametrize("rows", [1, 100, 65_536, 200_001])
+def test_the_deviation_in_parts_is_numpys(rows):
+    values = np.random.default_rng(0).normal(3.0, 2.0, (rows, 5)).astype(np.float16)
+    mean = values.mean(axis=0, dtype=np.float64)
+    np.testing.assert_array_equal(deviation_of(values, mean), values.std(axis=0, dtype=np.float64))

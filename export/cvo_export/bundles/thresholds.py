@@ -6,6 +6,7 @@ Coverage then does not depend on the fidelity of the export: the graph that runs
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -93,6 +94,7 @@ def observe(
     """
     kept: list[int] = []
     seen: list[Observation] = []
+    reasons: Counter[str] = Counter()
     invalid = degraded = 0
     for index in indices.tolist():
         try:
@@ -100,16 +102,19 @@ def observe(
         except SourceError:
             image = None  # flagged as invalid, as on the device
         observation = observer.observe(image, seq=index)
-        if observation.fault is not None:
-            invalid += 1
-        elif observation.doubt is not None:
-            degraded += 1
-        else:
+        problem = observation.fault or observation.doubt
+        if problem is None:
             kept.append(index)
             seen.append(observation)
+            continue
+        reasons[problem] += 1
+        invalid += observation.fault is not None
+        degraded += observation.fault is None
     if not seen:
+        found = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
         raise SourceError(
-            f"{dataset.name}: none of the {len(indices)} frames passes the frame checks"
+            f"{dataset.name}: expected frames that pass the frame checks, found none of "
+            f"{len(indices)}: {found}"
         )
     pose = np.array([observation.pose for observation in seen])
     true_pose = dataset.poses[kept]

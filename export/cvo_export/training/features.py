@@ -123,7 +123,8 @@ def cached_copies(
     the next copy.
     """
     zooms = config.zooms(copies)
-    features, poses = [], []
+    # Filled as they come: a list of all copies would need twice the memory.
+    features, poses = np.empty(0, np.float16), np.empty((copies + 1, len(images), 7))
     for number in range(copies + 1):
         path = folder / f"copy-{number:03d}.npz"
         found = _stored(path, len(images))
@@ -131,10 +132,11 @@ def cached_copies(
             graded = config.graded(number / max(1, copies))
             found = _one_copy(images, extractor, graded, (seed, number), zooms[number])
             _store(path, found)
-        features.append(found["features"])
-        poses.append(found["poses"])
+        if not number:
+            features = np.empty((copies + 1, *found["features"].shape), np.float16)
+        features[number], poses[number] = found["features"], found["poses"]
         progress("features", number + 1, copies + 1)
-    return np.stack(features), np.stack(poses)
+    return features, poses
 
 
 def _stored(path: Path, count: int) -> dict[str, NDArray[Any]] | None:

@@ -28,6 +28,8 @@ Indices = NDArray[np.int64]
 
 DOF = 6
 
+_ROWS_AT_ONCE = 65536
+
 
 class Standardise(nn.Module):
     """Scale features (n, size) to mean 0 and deviation 1 over the training images.
@@ -45,8 +47,9 @@ class Standardise(nn.Module):
 
     def fit(self, features: NDArray[np.float16] | NDArray[np.float32]) -> None:
         """Set mean and deviation from features (copies, n, size)."""
-        deviation = features.std((0, 1), dtype=np.float64)
-        self.mean.copy_(torch.from_numpy(features.mean((0, 1), dtype=np.float64)))
+        mean = features.mean((0, 1), dtype=np.float64)
+        deviation = deviation_of(features.reshape(-1, features.shape[-1]), mean)
+        self.mean.copy_(torch.from_numpy(mean))
         # Without a floor, a feature that is nearly always zero would explode where it is not.
         self.std.copy_(torch.from_numpy(deviation + 0.1 * deviation.mean()))
 
@@ -54,6 +57,18 @@ class Standardise(nn.Module):
         """Shape (n, size) -> (n, size)."""
         x = (features - self.mean) / self.std
         return x + self.noise * torch.randn_like(x) if self.training else x
+
+
+def deviation_of(rows: NDArray[Any], mean: Array) -> Array:
+    """Return the standard deviation of rows (n, size) with a known mean (size,).
+
+    Equal to numpy's bit by bit, which would need memory for all rows in float64.
+    """
+    total = np.zeros_like(mean)
+    for start in range(0, len(rows), _ROWS_AT_ONCE):
+        squared = np.square(rows[start : start + _ROWS_AT_ONCE] - mean)
+        total = np.add.reduce(np.concatenate([total[np.newaxis], squared]))
+    return np.asarray(np.sqrt(total / len(rows)))
 
 
 def dense(inputs: int, outputs: int, dropout: float = 0.0) -> list[nn.Module]:
@@ -241,7 +256,8 @@ class Method:
 
     ``restore`` rebuilds a head from its state dict, given the setting and options of its training.
     ``cells``: whether the head reads the map of a stem and trains the stages after it. ``copies``,
-    ``steps`` and ``augment`` are the defaults of a run.
+    ``steps`` and ``augment`` are the defaults of a run; with cells, large data sets get fewer
+    copies.
     """
 
     config: type[Struct]

@@ -397,7 +397,9 @@ def trained_scr(lessons: Lessons, config: ScrConfig) -> ScrHead:
 
     if config.cell_steps:
         with torch.no_grad():
-            cells = np.stack([_cells(upper, copy) for copy in maps])
+            cells = np.empty((*targets.shape[:3], upper.size), np.float16)
+            for number, copy in enumerate(maps):
+                cells[number] = _cells(upper, copy)
             val_cells = torch.from_numpy(_cells(upper, val_maps.numpy())).float()
         copies = len(maps)
         network = lessons.learn(
