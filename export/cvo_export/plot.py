@@ -30,6 +30,8 @@ TRUTH, POINT, BAND, MISSED = "#000000", "#0072B2", "#56B4E9", "#D55E00"
 # More boxes would hide one another.
 BOXES = 60
 _DPI = 130
+# Sets narrower than this share of the motion would be a line: they are drawn about the prediction.
+_THIN = 0.05
 
 
 def plot(
@@ -45,7 +47,8 @@ def plot(
     """Draw each degree of freedom over the frames, and x against y, into one figure.
 
     The bands of a disjoint set are drawn separately, and frames whose truth lies outside the set
-    are marked. Rotations are in degrees; in a chart about the prediction they are offsets from it.
+    are marked. Rotations are in degrees; in a chart about the prediction they are offsets from it,
+    as are degrees of freedom whose sets are much narrower than the motion.
     ``sequence`` names one sequence of the data set; None draws all frames of the subset in order.
 
     Raises
@@ -155,8 +158,15 @@ def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
     """Draw one degree of freedom over the frames: sets, point, truth and missed frames."""
     _, chart, estimates, truth, rows = drawn
     scale, unit = (1.0, "m") if dof < 3 else (float(np.rad2deg(1.0)), "deg")
-    shown = scale * truth[rows, dof]
     point = np.array([chart.point(_array(estimates[row]))[dof] for row in rows])
+    about = dof > 2 and chart.rotation == "tangent_predicted"
+    origin = np.zeros(len(estimates))
+    width = [estimates[row].upper[dof] - estimates[row].lower[dof] for row in rows]
+    if np.median(width) < _THIN * np.ptp(truth[rows, dof]):
+        about, scale, unit = True, *((100.0, "cm") if dof < 3 else (scale, unit))
+        origin[rows] = point
+    values = scale * (truth[:, dof] - origin)
+    shown = values[rows]
     spread = max(float(np.ptp(shown)), 1e-6)
     low, high = shown.min() - spread, shown.max() + spread
     bottoms, heights, places, missed = [], [], [], []
@@ -166,7 +176,7 @@ def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
             estimate.bands[dof] if estimate.bands else ((estimate.lower[dof], estimate.upper[dof]),)
         )
         for start, end in bands:
-            bottom, top = np.clip((scale * start, scale * end), low, high)
+            bottom, top = np.clip(scale * (np.array([start, end]) - origin[row]), low, high)
             bottoms.append(bottom)
             heights.append(top - bottom)
             places.append(row)
@@ -177,13 +187,13 @@ def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
         ):
             missed.append(row)
     axes.bar(places, heights, 1.0, bottoms, color=BAND, alpha=0.6, linewidth=0, label="set")
-    axes.plot(rows, scale * point, color=POINT, linewidth=0.9, label="point")
+    axes.plot(rows, scale * (point - origin[rows]), color=POINT, linewidth=0.9, label="point")
     axes.plot(rows, shown, color=TRUTH, linewidth=0.9, label="truth")
     regions = any(estimates[row].conformal_set.ellipsoids for row in rows)
     label = "outside the six-DoF region" if regions else "missed"
-    axes.plot(missed, scale * truth[missed, dof], "x", color=MISSED, markersize=5, label=label)
+    axes.plot(missed, values[missed], "x", color=MISSED, markersize=5, label=label)
     axes.set_ylim(shown.min() - 0.4 * spread, shown.max() + 0.4 * spread)
-    kind = " about the prediction" if dof > 2 and chart.rotation == "tangent_predicted" else ""
+    kind = " about the prediction" if about else ""
     axes.set_ylabel(f"{chart.dof[dof]} ({unit}){kind}")
     axes.set_xlabel("frame")
     axes.margins(x=0.01)
