@@ -4,9 +4,9 @@
 
 The map is made from the frames that the methods train on (roles train and fit). A frame's keypoints
 are matched with the map's descriptors; RANSAC with SQPnP (Terzakis and Lourakis 2020) finds the
-pose, and the solver of SCR refines it on all matches and gives its covariance, with the scale of
-the errors that the matches show. Thresholds come from cal by both rules; a frame without a pose
-gets the whole workspace.
+pose, and the solver of SCR refines it on all matches and gives its covariance; a scale per frame,
+from the errors of its matches, makes the intervals wider. Thresholds come from cal by both rules; a
+frame without a pose gets the whole workspace.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cvo_edge.camera import Camera
 from cvo_edge.conformal import conformal_quantile, hierarchical_quantile, interval_score
 from cvo_edge.errors import SourceError
 from cvo_edge.pose import Chart
-from cvo_edge.pose_solver import PoseSolver, dispersion
+from cvo_edge.pose_solver import PoseSolver
 from cvo_export.data.sparse_map import SparseMap, keypoints, sparse_map
 from cvo_export.data.splits import make_split
 from cvo_export.datasets import PoseDataset, open_dataset
@@ -37,7 +37,6 @@ CONFIDENCE = 0.9
 CHART = Chart("tangent_predicted")
 # A match is kept up to this ratio of distances; RANSAC's inliers, in pixels of a 640 wide image.
 RATIO, INLIER_PX, LEAST_MATCHES = 0.9, 6.0, 8
-EM_STEPS = 20
 
 
 class Located(NamedTuple):
@@ -86,8 +85,7 @@ def locate(
     R = cv2.Rodrigues(rotation)[0].T
     start = np.concatenate([-R @ translation[:, 0], geometry.matrix_to_quaternion(R)])
     refined = PoseSolver(rays, start[np.newaxis], damping).solve(points, np.full(len(rays), pixel))
-    variance = dispersion(refined.squared, EM_STEPS) * np.diag(np.linalg.inv(refined.information))
-    return refined.pose, np.sqrt(variance)
+    return refined.pose, np.sqrt(np.diag(np.linalg.inv(refined.information)))
 
 
 def located(

@@ -77,7 +77,8 @@ def plot(
     figure = Figure(figsize=(15, 11), layout="constrained")
     grid = figure.add_gridspec(3, 3)
     for dof in range(6):
-        draw_dof(figure.add_subplot(grid[dof % 3, dof // 3]), drawn, dof)
+        axes = figure.add_subplot(grid[dof % 3, dof // 3])
+        draw_dof(axes, drawn, dof, relative=_is_thin(drawn, dof))
     draw_from_above(figure.add_subplot(grid[:2, 2]), drawn)
     calibration = drawn.calibration
     figure.suptitle(
@@ -154,15 +155,23 @@ def _truth(chart: Chart, estimates: list[PoseInterval], poses: Array) -> Array:
     return truth
 
 
-def draw_dof(axes: Axes, drawn: Track, dof: int) -> None:
-    """Draw one degree of freedom over the frames: sets, point, truth and missed frames."""
+def _is_thin(drawn: Track, dof: int) -> bool:
+    """Whether the sets of one degree of freedom are narrow beside the motion."""
+    width = [drawn.estimates[r].upper[dof] - drawn.estimates[r].lower[dof] for r in drawn.rows]
+    return bool(np.median(width) < _THIN * np.ptp(drawn.truth[drawn.rows, dof]))
+
+
+def draw_dof(axes: Axes, drawn: Track, dof: int, *, relative: bool = False) -> None:
+    """Draw one degree of freedom over the frames: sets, point, truth and missed frames.
+
+    ``relative`` draws offsets from the point.
+    """
     _, chart, estimates, truth, rows = drawn
     scale, unit = (1.0, "m") if dof < 3 else (float(np.rad2deg(1.0)), "deg")
     point = np.array([chart.point(_array(estimates[row]))[dof] for row in rows])
     about = dof > 2 and chart.rotation == "tangent_predicted"
     origin = np.zeros(len(estimates))
-    width = [estimates[row].upper[dof] - estimates[row].lower[dof] for row in rows]
-    if np.median(width) < _THIN * np.ptp(truth[rows, dof]):
+    if relative:
         about, scale, unit = True, *((100.0, "cm") if dof < 3 else (scale, unit))
         origin[rows] = point
     values = scale * (truth[:, dof] - origin)
