@@ -80,7 +80,9 @@ class Lesson:
             return
         examples = self._examples or self.material.examples(phase)
         if phase == 0:
-            self.learner.fit_inputs(examples.x[:, self.rows])
+            whole = self.rows.size == examples.x.shape[1]
+            # Chosen rows are a copy, which would double the memory.
+            self.learner.fit_inputs(examples.x if whole else examples.x[:, self.rows])
         x = torch.from_numpy(examples.x)
         y = torch.tensor(examples.y, dtype=torch.float32)
 
