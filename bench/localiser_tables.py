@@ -191,9 +191,36 @@ def redraws() -> str:
     return table(head, rows)
 
 
+def cost() -> str:
+    """Return time, memory and file of CJP and SCR in both precisions, and how long they train."""
+    found = read_result(FOLDER, "cost")["bundles"]
+    rows = []
+    for name, figures in found.items():
+        method = name.split()[0]
+        frames = (
+            f"{figures['frame'][threads]['ms']['median']:.2f} ms, "
+            f"{figures['frame'][threads]['over_reference']['median']:.2f} x"
+            for threads in ("1", "2")
+        )
+        timed = [cell for cell in cells("new flights", method) if cell["training"]]
+        seconds = median(timed, lambda c: c["training"]["processor"])
+        rows.append(
+            [
+                name,
+                *frames,
+                f"{figures['peak_mib']:.0f} MiB",
+                f"{figures['model_bytes'] / 1e6:.2f} MB",
+                f"{seconds / 60:.0f} min" if name.endswith("fp32") else "the same",
+            ]
+        )
+    head = ["", "frame, one thread", "two threads", "peak memory", "`model.onnx`"]
+    return table([*head, "training, processor"], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "localiser": accuracy,
     "localiser-strangers": strangers,
     "localiser-cameras": other_cameras,
     "localiser-redraws": redraws,
+    "localiser-cost": cost,
 }

@@ -1,8 +1,10 @@
 """Whether the running camera is the one that was stated, from the frames of a stream.
 
 A frame whose pose was solved from scene coordinates also says a little about the camera
-(``PoseSolver.lens_evidence``). Each frame alone says too little, but evidence adds up: over a
-window of frames, a focal length that is off by a few percent or an unknown distortion shows.
+(``PoseSolver.lens_evidence``): a gradient g and a curvature H of the likelihood in the logarithms
+of both focal lengths and a radial distortion, which add up over frames. The lens that frames show
+is (sum H)^-1 sum g, with covariance (sum H)^-1. Two frames suffice where the lens is off by many
+deviations; over a window, a few percent of focal length show in hard frames, too.
 """
 
 from __future__ import annotations
@@ -19,9 +21,12 @@ from cvo_edge.bundle.format import Positive
 from cvo_edge.pose_solver import PoseSolver
 
 Array = NDArray[np.float64]
+# Gradient (3,) and information (3, 3) of one frame.
+Evidence = tuple[Array, Array]
 
-# Frames whose evidence is added; fewer give no verdict.
-WINDOW = 20
+# Frames whose evidence is added: where a lens must be off by more than a limit, and where it must
+# be off by many deviations as well.
+WINDOW, PAIR = 20, 2
 # Frames in which a larger share of cells contradicts the pose are weak evidence: what seems to be
 # another camera may be a part of the place that the network knows badly. With them, the limits are
 # wider by a factor; without them, a camera that is far off would leave no evidence.
@@ -32,6 +37,8 @@ _KEPT = 64
 # be a poor measure: one badly known recording would switch the check off. Distortion is less
 # certain, as only the corners of an image show it.
 _FOCAL_MARGIN, _DISTORTION_MARGIN = 3.5, 6.0
+# Limits in deviations over the largest of all pairs, which differ less between recordings.
+_DEVIATION_MARGIN = 2.0
 # Limits of a camera that the network has not learned are wider by a factor: its cells err more, and
 # a narrower image tells focal length from distance less well.
 _OTHER = 2.0
@@ -40,13 +47,15 @@ _PRIOR = 1e-6
 
 
 class LensLimits(Struct, frozen=True, forbid_unknown_fields=True):
-    """The largest deviations that frames of the known camera may show over a window.
+    """The largest differences that frames of the known camera may show over a window.
 
-    ``log_focal``: logarithm of the factor of either focal length; ``distortion``: additional k1.
+    ``log_focal``: logarithm of the factor of either focal length; ``distortion``: additional k1;
+    ``deviations``: over two frames, of the logarithms of fx and fy and of k1, in deviations.
     """
 
     log_focal: Positive
     distortion: Positive
+    deviations: tuple[Positive, Positive, Positive]
 
 
 class LensEstimate(NamedTuple):
@@ -86,10 +95,11 @@ class CameraCheck:
         learned: bool = True,
     ) -> None:
         self._solver, self._focal_px, self._error_px = solver, focal_px, error_px
-        values = np.array([limits.log_focal, limits.log_focal, limits.distortion])
-        self._limits = values if learned else _OTHER * values
-        self._clear: deque[tuple[Array, Array]] = deque(maxlen=WINDOW)
-        self._familiar: deque[tuple[Array, Array]] = deque(maxlen=WINDOW)
+        factor = 1.0 if learned else _OTHER
+        self._limits = factor * np.array([limits.log_focal, limits.log_focal, limits.distortion])
+        self._deviations = factor * np.array(limits.deviations)
+        self._clear: deque[Evidence] = deque(maxlen=WINDOW)
+        self._familiar: deque[Evidence] = deque(maxlen=WINDOW)
         self._kept: list[tuple[Array, Array, Array]] = []
         self._seen, self._stride = 0, 1
 
@@ -107,10 +117,19 @@ class CameraCheck:
             self._familiar.append(evidence)
             if _is_clear(outputs["signs"])[0]:
                 self._clear.append(evidence)
-        return any(
+        return self._pair_differs() or any(
             len(window) == WINDOW and (np.abs(summed(list(window))) > factor * self._limits).any()
             for window, factor in ((self._clear, 1.0), (self._familiar, _WEAK))
         )
+
+    def _pair_differs(self) -> bool:
+        """Whether the last two clear frames show a lens that is off by too many deviations."""
+        if len(self._clear) < PAIR:
+            return False
+        pair = [self._clear[-2], self._clear[-1]]
+        beyond = np.abs(summed(pair)) > self._limits
+        # Few frames come this far, so that the covariance costs nothing.
+        return bool(beyond.any() and (beyond & (in_deviations(pair) > self._deviations)).any())
 
     def estimate(self) -> LensEstimate | None:
         """Return the camera that the frames show; None if none explains them, or for few frames."""
@@ -131,10 +150,21 @@ class CameraCheck:
             self._stride *= 2
 
 
-def summed(evidence: Sequence[tuple[Array, Array]]) -> Array:
+def summed(evidence: Sequence[Evidence]) -> Array:
     """Gradients (3,) and informations (3, 3) of several frames -> the lens (3,) they show."""
     gradient, information = (np.sum(each, axis=0) for each in zip(*evidence, strict=True))
     return np.linalg.solve(information + _PRIOR * np.eye(3), gradient)
+
+
+def in_deviations(evidence: Sequence[Evidence]) -> Array:
+    """Gradients and informations of several frames -> sizes (3,) of the lens they show.
+
+    In deviations; 0 where they leave the lens open.
+    """
+    information = np.sum([each for _, each in evidence], axis=0) + _PRIOR * np.eye(3)
+    variance = np.diag(np.linalg.inv(information))
+    lens = np.abs(summed(evidence))
+    return np.where(variance > 0.0, lens / np.sqrt(np.where(variance > 0.0, variance, 1.0)), 0.0)
 
 
 def fitted_limits(
@@ -144,22 +174,26 @@ def fitted_limits(
 
     None if no recording fills a window.
     """
-    largest = []
+    largest, deviations = [], [np.zeros(3)]
     clear = _is_clear(outputs["signs"])
     gradient, information = outputs["lens_gradient"], outputs["lens_information"]
     for number in np.unique(sequence):
         frames = np.flatnonzero((sequence == number) & clear)
-        found = [
-            summed([(gradient[i], information[i]) for i in frames[start : start + WINDOW]])
-            for start in range(len(frames) - WINDOW + 1)
-        ]
+        evidence = [(gradient[i], information[i]) for i in frames]
+        deviations += [in_deviations(pair) for pair in _windows(evidence, PAIR)]
+        found = [summed(window) for window in _windows(evidence, WINDOW)]
         if found:
             lens = np.abs(found).max(axis=0)
             largest.append((lens[:2].max(), lens[2]))
     if not largest:
         return None
     log_focal, distortion = np.median(largest, axis=0).tolist()
-    return LensLimits(_FOCAL_MARGIN * log_focal, _DISTORTION_MARGIN * distortion)
+    fx, fy, k1 = (_DEVIATION_MARGIN * np.max(deviations, axis=0)).tolist()
+    return LensLimits(_FOCAL_MARGIN * log_focal, _DISTORTION_MARGIN * distortion, (fx, fy, k1))
+
+
+def _windows(evidence: list[Evidence], length: int) -> list[list[Evidence]]:
+    return [evidence[start : start + length] for start in range(len(evidence) - length + 1)]
 
 
 def _is_clear(signs: NDArray[Any]) -> NDArray[np.bool_]:

@@ -286,7 +286,7 @@ class ScrHead(Head):
 
     def joint_description(self, joint: Joint) -> str:
         """As ``Head``."""
-        return "distance by the solver's covariance"
+        return "Mahalanobis distance under the solver's covariance"
 
     def _floored(self, scale: NDArray[Any]) -> tuple[Array, Array]:
         """Scales (..., 6, 6) -> scales with enlarged rows, and deviations (..., 6)."""

@@ -6,12 +6,22 @@ import pytest
 from scipy.optimize import minimize
 
 from cvo_edge import geometry
-from cvo_edge.camera_check import WINDOW, CameraCheck, LensLimits, fitted_limits, summed
+from cvo_edge.camera_check import (
+    PAIR,
+    WINDOW,
+    CameraCheck,
+    LensLimits,
+    fitted_limits,
+    in_deviations,
+    summed,
+)
 from cvo_edge.pose_solver import NU, PoseSolver
 
 START = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
 FOCAL_PX = 240.0
-LIMITS = LensLimits(log_focal=0.02, distortion=0.05)
+# Without a verdict on pairs.
+NEVER = (1e6, 1e6, 1e6)
+LIMITS = LensLimits(log_focal=0.02, distortion=0.05, deviations=NEVER)
 
 
 def grid_rays():
@@ -51,8 +61,8 @@ def outputs_of(points, scale, pose):
     }
 
 
-def check():
-    return CameraCheck(solver(), FOCAL_PX, LIMITS, error_px=1.0)
+def check(limits=LIMITS, **options):
+    return CameraCheck(solver(), FOCAL_PX, limits, error_px=1.0, **options)
 
 
 def test_evidence_is_the_derivative_of_the_profiled_likelihood():
@@ -95,6 +105,38 @@ def test_a_window_of_frames_shows_five_percent(lens):
     ]
     assert not any(found[: WINDOW - 1])
     assert set(found[WINDOW - 1 :]) == {any(lens)}
+
+
+@pytest.mark.parametrize(
+    ("drift", "learned", "differs"),
+    [(0.0, True, False), (0.1, True, True), (0.1, False, True), (0.01, False, False)],
+)
+def test_two_frames_show_a_lens_that_is_off_by_many_deviations(drift, learned, differs):
+    generator = np.random.default_rng(9)
+    limits = msgspec.structs.replace(LIMITS, deviations=(3.0, 3.0, 3.0))
+    stream = check(limits, learned=learned)
+    lens = np.array([drift, drift, 0.0])
+    frames = [outputs_of(*seen_by(lens, generator, noise=5e-4)) for _ in range(WINDOW - 1)]
+    found = [stream.differs(frame, familiar=True) for frame in frames]
+    assert not found[PAIR - 2]
+    assert set(found[PAIR - 1 :]) == {differs}
+
+
+def test_deviations_are_those_of_the_lens_that_frames_show():
+    """Over many frames of the known camera, they are those of a normal variable."""
+    generator = np.random.default_rng(10)
+    found = []
+    for _ in range(200):
+        frames = [outputs_of(*seen_by(np.zeros(3), generator)) for _ in range(PAIR)]
+        evidence = [(each["lens_gradient"][0], each["lens_information"][0]) for each in frames]
+        found.append(in_deviations(evidence))
+    rms = np.sqrt(np.square(found).mean(axis=0))
+    np.testing.assert_allclose(rms, 1.0, atol=0.5)
+
+
+def test_frames_that_leave_the_lens_open_are_no_evidence():
+    evidence = [(np.ones(3), -np.eye(3))] * PAIR
+    np.testing.assert_array_equal(in_deviations(evidence), 0.0)
 
 
 @pytest.mark.parametrize("lens", [(0.0, 0.0, 0.0), (0.2, 0.2, 0.0), (0.1, 0.0, 0.0), (0, 0, -0.3)])
@@ -153,6 +195,10 @@ def test_limits_lie_beyond_the_known_recording():
     limits = fitted_limits(outputs, sequence)
     assert limits.log_focal > 2.0 * found[:2].max()
     assert limits.distortion > 2.0 * found[2]
+    stream = check(limits)
+    for row in range(WINDOW):
+        frame = {name: values[row : row + 1] for name, values in outputs.items()}
+        assert not stream.differs(frame, familiar=True)
 
 
 def test_recordings_without_a_window_of_evidence_give_no_limits():
@@ -170,8 +216,8 @@ def test_frames_that_contradict_are_weak_evidence(contradicting, factor, differs
     frames = [outputs_of(*seen_by(np.array([0.03, 0.03, 0.0]), generator)) for _ in range(WINDOW)]
     evidence = [(each["lens_gradient"][0], each["lens_information"][0]) for each in frames]
     shown = np.abs(summed(evidence))
-    limits = LensLimits(float(shown[:2].max()) / factor, float(shown[2]) / factor)
-    stream = CameraCheck(solver(), FOCAL_PX, limits, error_px=1.0)
+    limits = LensLimits(float(shown[:2].max()) / factor, float(shown[2]) / factor, NEVER)
+    stream = check(limits)
     for outputs in frames:
         outputs["signs"][0, 1] = contradicting
         found = stream.differs(outputs, familiar=True)
