@@ -159,12 +159,16 @@ def summed(evidence: Sequence[Evidence]) -> Array:
 def in_deviations(evidence: Sequence[Evidence]) -> Array:
     """Gradients and informations of several frames -> sizes (3,) of the lens they show.
 
-    In deviations; 0 where they leave the lens open.
+    In deviations; 0 where they leave it open. A lens that is far off can bend the likelihood
+    upwards along the distortion: the deviations of the focal lengths are then those without it.
     """
     information = np.sum([each for _, each in evidence], axis=0) + _PRIOR * np.eye(3)
-    variance = np.diag(np.linalg.inv(information))
-    lens = np.abs(summed(evidence))
-    return np.where(variance > 0.0, lens / np.sqrt(np.where(variance > 0.0, variance, 1.0)), 0.0)
+    variance = np.diag(np.linalg.inv(information)).copy()
+    alone = np.diag(np.linalg.inv(information[:2, :2]))
+    variance[:2] = np.where(variance[:2] > 0.0, variance[:2], alone)
+    known = variance > 0.0
+    deviation = np.sqrt(np.where(known, variance, 1.0))
+    return np.where(known, np.abs(summed(evidence)) / deviation, 0.0)
 
 
 def fitted_limits(

@@ -118,8 +118,9 @@ def test_two_frames_show_a_lens_that_is_off_by_many_deviations(drift, learned, d
     lens = np.array([drift, drift, 0.0])
     frames = [outputs_of(*seen_by(lens, generator, noise=5e-4)) for _ in range(WINDOW - 1)]
     found = [stream.differs(frame, familiar=True) for frame in frames]
-    assert not found[PAIR - 2]
-    assert set(found[PAIR - 1 :]) == {differs}
+    assert not any(found[: PAIR - 1])
+    assert any(found[: PAIR + 3]) == differs
+    assert differs or not any(found)
 
 
 def test_deviations_are_those_of_the_lens_that_frames_show():
