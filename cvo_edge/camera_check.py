@@ -102,12 +102,15 @@ class CameraCheck:
         self._familiar: deque[Evidence] = deque(maxlen=WINDOW)
         self._kept: list[tuple[Array, Array, Array]] = []
         self._seen, self._stride = 0, 1
+        # Number of clear frames for which the verdict of two frames still holds.
+        self._held = 0
 
     def differs(self, outputs: Mapping[str, NDArray[Any]], *, familiar: bool) -> bool:
-        """Add one frame; return whether the frames of the window show another camera.
+        """Add one frame; return whether the frames of the stream show another camera.
 
         A frame that is not ``familiar`` counts for the estimate alone, because a camera that is
-        quite different makes all frames unfamiliar.
+        quite different makes all frames unfamiliar. The camera of a stream does not change: what
+        two frames have shown holds until a whole window of others has had its say.
         """
         if self._seen % self._stride == 0:
             self._keep(outputs)
@@ -117,7 +120,8 @@ class CameraCheck:
             self._familiar.append(evidence)
             if _is_clear(outputs["signs"])[0]:
                 self._clear.append(evidence)
-        return self._pair_differs() or any(
+                self._held = WINDOW if self._pair_differs() else max(0, self._held - 1)
+        return self._held > 0 or any(
             len(window) == WINDOW and (np.abs(summed(list(window))) > factor * self._limits).any()
             for window, factor in ((self._clear, 1.0), (self._familiar, _WEAK))
         )

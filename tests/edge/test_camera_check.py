@@ -123,6 +123,18 @@ def test_two_frames_show_a_lens_that_is_off_by_many_deviations(drift, learned, d
     assert differs or not any(found)
 
 
+def test_what_two_frames_show_holds_for_a_window_of_others():
+    generator = np.random.default_rng(11)
+    stream = check(msgspec.structs.replace(LIMITS, deviations=(3.0, 3.0, 3.0)))
+    for lens, frames in ((np.array([0.1, 0.1, 0.0]), PAIR), (np.zeros(3), WINDOW + 5)):
+        found = [
+            stream.differs(outputs_of(*seen_by(lens, generator, noise=1e-3)), familiar=True)
+            for _ in range(frames)
+        ]
+    assert all(found[: WINDOW - PAIR])
+    assert not any(found[WINDOW:])
+
+
 def test_deviations_are_those_of_the_lens_that_frames_show():
     """Over many frames of the known camera, they are those of a normal variable."""
     generator = np.random.default_rng(10)
