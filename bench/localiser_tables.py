@@ -139,8 +139,10 @@ def strangers() -> str:
 
 def _shares(figures: Report) -> str:
     text = f"{figures['finite']:.3f}, {figures['wrong']:.3f}"
-    if figures["noticed_after"] is not None:
-        text += f"; noticed after {figures['noticed_after']}"
+    noticed = [number for number in figures["noticed_after"] if number]
+    if noticed:
+        text += f"; from frame {np.median(noticed):g} in {len(noticed)} of "
+        text += f"{len(figures['noticed_after'])}"
     return text
 
 
@@ -159,6 +161,8 @@ def other_cameras() -> str:
 
 
 def _accuracy(figures: Report) -> list[str]:
+    if not figures["finite"]:
+        return ["0 %", *["-"] * 5]
     return [
         f"{100 * figures['finite']:.0f} %",
         f"{100 * figures['median_m']:.2f} cm",

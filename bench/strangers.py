@@ -41,10 +41,11 @@ FRAMES = 200
 
 
 class Seen(NamedTuple):
-    """An estimate, the true pose (7,) and the number of the frame in its recording, from 1."""
+    """An estimate, the true pose (7,), the recording, and the frame's number in it, from 1."""
 
     estimate: PoseInterval
     truth: Array
+    recording: int
     number: int
 
 
@@ -58,12 +59,18 @@ class Stream(NamedTuple):
         """Return shares of frames, and when and how another camera was noticed."""
         finite = [each for each in self.seen if each.estimate.bounded]
         wrong = sum(not each.estimate.contains(each.truth) for each in finite)
-        differs = [e.number for e in self.seen if Reason.CAMERA_DIFFERS in e.estimate.reasons]
+        # Of each recording; 0 where it is never noticed.
+        noticed: dict[int, int] = {}
+        for each in self.seen:
+            found = Reason.CAMERA_DIFFERS in each.estimate.reasons
+            noticed[each.recording] = noticed.get(each.recording) or (each.number if found else 0)
+        late = [number or np.inf for number in noticed.values()]
         return {
             "frames": len(self.seen),
             "finite": len(finite) / len(self.seen),
             "wrong": wrong / len(self.seen),
-            "noticed_after": min(differs, default=None),
+            "noticed_after": [number or None for number in noticed.values()],
+            "median_noticed_after": None if np.isinf(np.median(late)) else float(np.median(late)),
             "focal_factor": self.focal,
         }
 
@@ -99,7 +106,7 @@ def run(
             rows = indices[dataset.sequence[indices] == recording].tolist()
             images = (np.ascontiguousarray(change(dataset.read_image(row))) for row in rows)
             for number, (row, found) in enumerate(zip(rows, odometer.stream(images), strict=True)):
-                seen.append(Seen(found, dataset.poses[row], number + 1))
+                seen.append(Seen(found, dataset.poses[row], int(recording), number + 1))
             estimate = odometer.seen_camera or estimate
     return Stream(seen, estimate and float(np.sqrt(estimate.fx * estimate.fy)))
 
@@ -182,8 +189,12 @@ def line(name: str, found: dict[str, Any]) -> str:
     """Return one row of the printed table."""
     text = f"  {name:<30} {found['frames']:>4} frames, finite {found['finite']:.3f}, wrong "
     text += f"{found['wrong']:.3f}"
-    if found["noticed_after"] is not None:
-        text += f", camera_differs from frame {found['noticed_after']}"
+    noticed = [number for number in found["noticed_after"] if number]
+    if noticed:
+        text += (
+            f", camera_differs in {len(noticed)} of {len(found['noticed_after'])} recordings, from "
+            f"frame {np.median(noticed):g} (median; {min(noticed)} to {max(noticed)})"
+        )
     if found["focal_factor"] is not None:
         text += f", focal length x {found['focal_factor']:.3f}"
     if "coverage" in found:

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.errors import UsageError
+from cvo_edge.files import read_regular_file
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,10 @@ _COUNTS: dict[Distortion, tuple[int, ...]] = {
 # Newton's method needs 4 to 8 steps; a pixel beyond the model's range never converges.
 _STEPS = 50
 _CONVERGED = 1e-9
+# Places between the optical axis and a ray where the lens must not turn the image back.
+_ALONG = 33
+# Smallest side of an image, largest camera file.
+_LEAST_SIDE, _LARGEST_FILE = 16, 64 * 1024
 
 
 class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
@@ -106,13 +111,14 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit
         with np.errstate(all="ignore"):
             for _ in range(_STEPS):
                 found, jacobian = self._distorted(rays)
-                step = np.linalg.solve(jacobian, (distorted - found)[..., np.newaxis])[..., 0]
-                rays = rays + step
-            found, jacobian = self._distorted(rays)
-            close = np.abs(found - distorted).max(axis=-1) < _CONVERGED
+                rays = rays + _solved(jacobian, distorted - found)
+            found, _ = self._distorted(rays)
+            right = np.abs(found - distorted).max(axis=-1) < _CONVERGED
             # Beyond the angle where the image turns back, another ray has the same pixel.
-            wrong = ~(close & (np.linalg.det(jacobian) > 0.0))
-        rays[wrong] = np.nan
+            for share in np.linspace(0.0, 1.0, _ALONG):
+                _, jacobian = self._distorted(share * rays)
+                right &= _determinant(jacobian) > 0.0
+        rays[~right] = np.nan
         return rays
 
     def project(self, points: ArrayLike) -> Array:
@@ -159,13 +165,34 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit
 
 def read_camera(path: Path) -> Camera:
     """Read a camera from a JSON file with the fields of ``Camera``; raises UsageError."""
+    content = read_regular_file(path, _LARGEST_FILE, UsageError)
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Camera)
-    except OSError as error:
-        raise UsageError(f"{path}: expected a camera file, found {error.strerror}") from None
-    except msgspec.MsgspecError as error:
+        return msgspec.json.decode(content, type=Camera)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         form = '{"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0}'
         raise UsageError(f"{path}: expected JSON such as {form}, found: {error}") from None
+
+
+def checked_camera(camera: object) -> Camera:
+    """Return a camera that a caller gives; raises UsageError for anything that cannot be one."""
+    if not isinstance(camera, Camera):
+        raise UsageError(f"camera: expected a Camera, found {type(camera).__name__}")
+    try:
+        checked = msgspec.convert(msgspec.to_builtins(camera), Camera)
+    except (msgspec.ValidationError, TypeError, ValueError, KeyError) as error:
+        raise UsageError(f"camera: expected the intrinsics of a camera, found: {error}") from None
+    if min(checked.width, checked.height) < _LEAST_SIDE:
+        raise UsageError(
+            f"camera: expected images of at least {_LEAST_SIDE} pixels a side, found "
+            f"{checked.width}x{checked.height}"
+        )
+    for name, length in (("cx", checked.width), ("cy", checked.height)):
+        value = getattr(checked, name)
+        if not -length <= value <= 2 * length:
+            raise UsageError(
+                f"camera: expected {name} from {-length} to {2 * length} pixels, found {value:g}"
+            )
+    return checked
 
 
 def cell_centres(height: int, width: int, grid: tuple[int, int]) -> Array:
@@ -174,6 +201,20 @@ def cell_centres(height: int, width: int, grid: tuple[int, int]) -> Array:
     x = (np.arange(columns) + 0.5) * (width / columns) - 0.5
     y = (np.arange(rows) + 0.5) * (height / rows) - 0.5
     return np.stack([np.tile(x, rows), np.repeat(y, columns)], axis=1)
+
+
+def _determinant(jacobian: Array) -> Array:
+    return np.asarray(
+        jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
+    )
+
+
+def _solved(jacobian: Array, y: Array) -> Array:
+    """Solve (n, 2, 2) x = (n, 2) by Cramer's rule; not finite where the matrix is singular."""
+    a, b, c, d = (jacobian[..., row, column] for row in (0, 1) for column in (0, 1))
+    u, v = y[..., 0], y[..., 1]
+    solution = np.stack([d * u - b * v, a * v - c * u], axis=-1)
+    return np.asarray(solution / _determinant(jacobian)[..., np.newaxis])
 
 
 def _equidistant(rays: Array, r2: Array, coefficients: tuple[float, ...]) -> tuple[Array, Array]:

@@ -4,13 +4,16 @@ A frame whose pose was solved from scene coordinates also says a little about th
 (``PoseSolver.lens_evidence``): a gradient g and a curvature H of the likelihood in the logarithms
 of both focal lengths and a radial distortion, which add up over frames. The lens that frames show
 is (sum H)^-1 sum g, with covariance (sum H)^-1. Two frames suffice where the lens is off by many
-deviations; over a window, a few percent of focal length show in hard frames, too.
+deviations; over a window, a few percent of focal length show in hard frames, too. Frames from
+nearly the same pose err in the same way: only frames that have moved add evidence.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,11 +40,14 @@ _KEPT = 64
 # be a poor measure: one badly known recording would switch the check off. Distortion is less
 # certain, as only the corners of an image show it.
 _FOCAL_MARGIN, _DISTORTION_MARGIN = 3.5, 6.0
-# Limits in deviations over the largest of all pairs, which differ less between recordings.
-_DEVIATION_MARGIN = 2.0
+# Limits in deviations over the largest of all pairs, which differ less between recordings; but not
+# more over what the median recording shows at most.
+_DEVIATION_MARGIN, _DEVIATION_MOST = 2.0, 4.0
 # Limits of a camera that the network has not learned are wider by a factor: its cells err more, and
 # a narrower image tells focal length from distance less well.
 _OTHER = 2.0
+# Share of the usual motion between two frames of a recording that makes a frame new evidence.
+_STEP_SHARE, _LEAST_STEP = 0.5, 1e-6
 # The least distinct directions keep an estimate of what the frames leave open near zero.
 _PRIOR = 1e-6
 
@@ -51,11 +57,14 @@ class LensLimits(Struct, frozen=True, forbid_unknown_fields=True):
 
     ``log_focal``: logarithm of the factor of either focal length; ``distortion``: additional k1;
     ``deviations``: over two frames, of the logarithms of fx and fy and of k1, in deviations.
+    ``step``: frames that have moved by less than this position (m) and rotation (rad) since the
+    last one are no evidence.
     """
 
     log_focal: Positive
     distortion: Positive
     deviations: tuple[Positive, Positive, Positive]
+    step: tuple[Positive, Positive]
 
 
 class LensEstimate(NamedTuple):
@@ -98,6 +107,8 @@ class CameraCheck:
         factor = 1.0 if learned else _OTHER
         self._limits = factor * np.array([limits.log_focal, limits.log_focal, limits.distortion])
         self._deviations = factor * np.array(limits.deviations)
+        self._step = np.array(limits.step)
+        self._last: Array | None = None
         self._clear: deque[Evidence] = deque(maxlen=WINDOW)
         self._familiar: deque[Evidence] = deque(maxlen=WINDOW)
         self._kept: list[tuple[Array, Array, Array]] = []
@@ -116,7 +127,9 @@ class CameraCheck:
             self._keep(outputs)
         self._seen += 1
         evidence = outputs["lens_gradient"][0], outputs["lens_information"][0]
-        if familiar:
+        pose = outputs["solved_pose"][0]
+        if familiar and (self._last is None or (_motion(self._last, pose) > self._step).any()):
+            self._last = pose
             self._familiar.append(evidence)
             if _is_clear(outputs["signs"])[0]:
                 self._clear.append(evidence)
@@ -139,7 +152,8 @@ class CameraCheck:
         """Return the camera that the frames show; None if none explains them, or for few frames."""
         if len(self._kept) < WINDOW:
             return None
-        lens, error = self._solver.lens_fit(self._kept)
+        # Another thread may be adding a frame.
+        lens, error = self._solver.lens_fit(list(self._kept))
         if not np.median(error) * self._focal_px <= self._error_px:
             return None
         fx, fy = np.exp(lens[:2]).tolist()
@@ -182,13 +196,18 @@ def fitted_limits(
 
     None if no recording fills a window.
     """
-    largest, deviations = [], [np.zeros(3)]
+    largest, deviations = [], []
     clear = _is_clear(outputs["signs"])
     gradient, information = outputs["lens_gradient"], outputs["lens_information"]
-    for number in np.unique(sequence):
-        frames = np.flatnonzero((sequence == number) & clear)
-        evidence = [(gradient[i], information[i]) for i in frames]
-        deviations += [in_deviations(pair) for pair in _windows(evidence, PAIR)]
+    poses = outputs["solved_pose"]
+    recordings = [np.flatnonzero(sequence == number) for number in np.unique(sequence)]
+    step = _usual_step(poses, recordings)
+    for frames in recordings:
+        moved = _moved(poses, frames, step)
+        evidence = [(gradient[i], information[i]) for i in moved if clear[i]]
+        pairs = [in_deviations(pair) for pair in _windows(evidence, PAIR)]
+        if pairs:
+            deviations.append(np.max(pairs, axis=0))
         found = [summed(window) for window in _windows(evidence, WINDOW)]
         if found:
             lens = np.abs(found).max(axis=0)
@@ -196,8 +215,35 @@ def fitted_limits(
     if not largest:
         return None
     log_focal, distortion = np.median(largest, axis=0).tolist()
-    fx, fy, k1 = (_DEVIATION_MARGIN * np.max(deviations, axis=0)).tolist()
-    return LensLimits(_FOCAL_MARGIN * log_focal, _DISTORTION_MARGIN * distortion, (fx, fy, k1))
+    most = _DEVIATION_MOST * np.median(deviations, axis=0)
+    fx, fy, k1 = np.minimum(_DEVIATION_MARGIN * np.max(deviations, axis=0), most).tolist()
+    metres, radians = step.tolist()
+    return LensLimits(
+        _FOCAL_MARGIN * log_focal, _DISTORTION_MARGIN * distortion, (fx, fy, k1), (metres, radians)
+    )
+
+
+def _motion(pose: Array, other: Array) -> Array:
+    """Return distance, m, and angle, rad, between two poses (7,), as an array (2,)."""
+    cosine = min(1.0, abs(float(pose[3:] @ other[3:])))
+    return np.array([np.linalg.norm(pose[:3] - other[:3]), 2.0 * math.acos(cosine)])
+
+
+def _usual_step(poses: Array, recordings: Sequence[NDArray[np.int64]]) -> Array:
+    """Return a share of the median motion between neighbouring frames of recordings, (2,)."""
+    steps = [_motion(poses[i], poses[j]) for frames in recordings for i, j in pairwise(frames)]
+    if not steps:
+        return np.full(2, _LEAST_STEP)
+    return np.maximum(_STEP_SHARE * np.median(steps, axis=0), _LEAST_STEP)
+
+
+def _moved(poses: Array, frames: NDArray[np.int64], step: Array) -> list[int]:
+    """Return the frames that have moved since the one before them that has."""
+    kept: list[int] = []
+    for i in frames.tolist():
+        if not kept or (_motion(poses[kept[-1]], poses[i]) > step).any():
+            kept.append(i)
+    return kept
 
 
 def _windows(evidence: list[Evidence], length: int) -> list[list[Evidence]]:

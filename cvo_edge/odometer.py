@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Threshold
-from cvo_edge.camera import Camera
+from cvo_edge.camera import Camera, checked_camera
 from cvo_edge.camera_check import LensEstimate
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.model_cache import ModelCache
@@ -104,6 +104,7 @@ class Odometer:
         settings = plan(self.mode, threads)
         self._workers = settings.workers
         self.threads = settings.threads * settings.workers
+        camera = None if camera is None else checked_camera(camera)
         if camera is not None and not bundle.head.solves:
             raise UsageError(
                 f"camera: expected a method that solves for the pose, found {calibration.method}, "
@@ -296,7 +297,7 @@ class Odometer:
         # The age counts until the estimate is given: a process may be stopped at any point.
         age_ms = frame.age_ms(self._clock.now_s())
         doubts += self._stream_checks.doubts(observation.look, frame.stamp_ns, age_ms)
-        if self._camera_differs(observation) and Reason.CAMERA_DIFFERS not in doubts:
+        if self._camera_differs(observation, doubts):
             doubts += (Reason.CAMERA_DIFFERS,)
         if doubts:
             found = unbounded_set()
@@ -320,20 +321,17 @@ class Odometer:
             },
         )
 
-    def _camera_differs(self, observation: Observation) -> bool:
-        """Pass a frame to the camera check, unless something else is wrong with its image."""
-        if self._camera_check is None or observation.fault is not None:
+    def _camera_differs(self, observation: Observation, doubts: tuple[Reason, ...]) -> bool:
+        """Pass a frame to the camera check, unless something else is wrong with it."""
+        if self._camera_check is None or doubts not in ((), (Reason.IMAGE_UNFAMILIAR,)):
             return False
-        if observation.doubt not in (None, Reason.IMAGE_UNFAMILIAR):
-            return False
-        familiar = observation.doubt is None
-        return self._camera_check.differs(observation.outputs, familiar=familiar)
+        return self._camera_check.differs(observation.outputs, familiar=not doubts)
 
     @property
     def seen_camera(self) -> LensEstimate | None:
         """The camera that the frames of the stream show, relative to the stated one.
 
-        None if the method cannot tell, or for fewer than 30 frames of the known place.
+        None if the method cannot tell, for fewer than 20 frames, or if no camera explains them.
         """
         return None if self._camera_check is None else self._camera_check.estimate()
 

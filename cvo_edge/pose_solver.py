@@ -37,6 +37,8 @@ _LENS_STEPS, _LENS_PRECISION = 10, 1.0
 # Points closer to the image plane than this share of the damping deviation of the position, or
 # behind it, have no weight.
 _NEAR = 0.01
+# Squared error in units of the scale of such points.
+_BEHIND = 1e6
 
 
 class Solution(NamedTuple):
@@ -86,7 +88,8 @@ class PoseSolver:
         self._rays = np.ascontiguousarray(np.where(self.seen[:, np.newaxis], rays, 0.0).T)
         self._R = geometry.quaternion_to_matrix(starts[:, 3:])
         self._t = np.ascontiguousarray(starts[:, :3])
-        self._precision = 1.0 / np.square(damping)
+        # The steps are along the camera's axes, which have no part in a deviation of their own.
+        self._precision = 1.0 / np.square(np.repeat([damping[:3].mean(), damping[3:].mean()], 3))
         self._near = _NEAR * float(damping[:3].mean())
 
     def solve(self, points: Array, scale: Array) -> Solution:
@@ -101,7 +104,7 @@ class PoseSolver:
         for _ in range(_NEWTON_STEPS):
             R, t, found = self._step(R, t, X, spread, newton=True)
         pose = np.array([*t.tolist(), *_quaternion(*R.ravel().tolist())])
-        return Solution(pose, _in_world(found.information, R), found.squared, found.length)
+        return Solution(pose, _in_world(found.information, R), found.squared, self._length(found))
 
     def _start(self, X: Array, spread: Array) -> tuple[Array, Array]:
         """Return the rotation (3, 3) and position (3,) of the start with the best likelihood."""
@@ -135,9 +138,17 @@ class PoseSolver:
             hessian = information - (2.0 / (NU + 2.0)) * (pull @ pull.T)
             information = hessian if _positive_definite(hessian) else information
         step = np.linalg.solve(information, gradient)
-        length = math.sqrt(max(float(step @ gradient), 0.0))
-        found = _Step(information, squared * (NU / spread), length)
-        return *_moved(R, t, step), found
+        squared = np.where(ahead, squared * (NU / spread), _BEHIND)
+        return *_moved(R, t, step), _Step(information, squared, gradient)
+
+    def _length(self, step: _Step) -> float:
+        """Return a step's length in deviations, as if it had not been damped."""
+        try:
+            undamped = np.linalg.solve(step.information - np.diag(self._precision), step.gradient)
+        except np.linalg.LinAlgError:
+            return math.inf
+        squared = float(undamped @ step.gradient)
+        return math.sqrt(squared) if squared >= 0.0 else math.inf
 
     def _projected(self, R: Array, t: Array, X: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Project points (3, n): image (2, n), its derivatives (6, 2, n), and which are ahead.
@@ -198,9 +209,12 @@ class PoseSolver:
             for number, solved in enumerate(systems):
                 move = np.asarray(solved[:, 3] - solved[:, :3] @ step)
                 R[number], t[number] = _moved(R[number], t[number], move)
+        seen = self.seen
         errors = [
             np.linalg.norm(
-                _distorted(self._projected(R_i, t_i, points.T)[0], lens) - self._rays, axis=0
+                _distorted(self._projected(R_i, t_i, points[seen].T)[0], lens)
+                - self._rays[:, seen],
+                axis=0,
             )
             for (points, _, _), R_i, t_i in zip(frames, R, t, strict=True)
         ]
@@ -266,7 +280,8 @@ class LensFit(NamedTuple):
     lens
         Shape (3,): the three numbers of ``LensEvidence``.
     error
-        Shape (frames, n): reprojection errors that remain, in normalised coordinates.
+        Shape (frames, n): reprojection errors that remain, in normalised coordinates, of the n
+        cells that have a ray.
     """
 
     lens: Array
@@ -298,11 +313,11 @@ def dispersion(squared: Array, steps: int) -> float:
 
 
 class _Step(NamedTuple):
-    """A step's information in the camera frame, squared errors and length, as in ``Solution``."""
+    """A step's information and gradient in the camera frame, and squared errors."""
 
     information: Array
     squared: Array
-    length: float
+    gradient: Array
 
 
 def _positive_definite(matrix: Array) -> bool:

@@ -32,6 +32,15 @@ def checked_head(calibration: Calibration) -> Head:
     head = kind(calibration.parameters(kind.parameters_type), source.score)
     head.check(calibration.thresholds, source.joint)
     check_tensors(calibration.model, head)
+    if head.solves and calibration.pose.rotation != "tangent_predicted":
+        raise CalibrationFileError(
+            f"pose.rotation: expected tangent_predicted for method {head.method}, found "
+            f"{calibration.pose.rotation}"
+        )
+    if head.solves and calibration.camera is None:
+        raise CalibrationFileError(
+            f"camera: expected intrinsics for method {head.method}, found null"
+        )
     if not head.one_joint_score:
         _check_joint(calibration.thresholds, head)
     return head

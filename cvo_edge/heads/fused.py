@@ -85,8 +85,10 @@ class FusedHead(ScrHead):
         """
         added = {"solved": found.information[np.newaxis]}
         fusion = self.parameters.fusion
-        if fusion is None or fusion.share == 0.0 or not seen.learned:
+        if fusion is None:
             return found.pose, found.information, added
+        if fusion.share == 0.0 or not seen.learned:
+            return found.pose, fusion.kappa * found.information, added
         regression = np.asarray(outputs["regression"][0], np.float64)
         regression[3:] = geometry.quaternion_normalise(regression[3:])
         pose, information, disagreement = fused(

@@ -55,6 +55,11 @@ _LEAST_SEEN = 0.25
 # A cell contradicts the pose if its reprojection error exceeds this many scales.
 _CONTRADICTS = 3.0
 _HAIR = 1e-12
+# Scales in pixels from e^-20 to e^20 are what a network may say.
+_LARGEST_LOG = 20.0
+# Deviations, m and rad, that damp the solver or bound a score from below.
+_LEAST_DEVIATION, _LARGEST_DEVIATION = 1e-7, 1e6
+_UNIT = 1e-3
 # Limits lie this far beyond the largest sign of the known frames, because a new recording of the
 # same place has frames that are a little harder.
 _MARGIN_ERROR, _MARGIN_CONTRADICTING = 1.3, 0.05
@@ -117,9 +122,10 @@ class ScrHead(Head):
         super().check(thresholds, joint)
         if joint != "max":
             raise CalibrationFileError(
-                "calibration.joint: expected max for scr, which has one score for all six DoF, "
-                f"found {joint}"
+                f"calibration.joint: expected max for {self.method}, which has one score for all "
+                f"six DoF, found {joint}"
             )
+        self._check_solver()
         for entry in thresholds:
             refuse_negative(entry, "scr")
             if entry.scope == "joint" and entry.q_hat != (entry.q_hat[0],) * 6:
@@ -127,6 +133,22 @@ class ScrHead(Head):
                     "thresholds.q_hat: expected the same distance six times for scr and scope "
                     f"joint, found {list(entry.q_hat)} at {entry.confidence}"
                 )
+
+    def _check_solver(self) -> None:
+        """Raise CalibrationFileError for parameters that no solver works with."""
+        for name in ("damping", "deviation_floor"):
+            values = getattr(self.parameters, name)
+            if not _LEAST_DEVIATION <= min(values) <= max(values) <= _LARGEST_DEVIATION:
+                raise CalibrationFileError(
+                    f"method_parameters.{name}: expected {_LEAST_DEVIATION:g} to "
+                    f"{_LARGEST_DEVIATION:g}, found {list(values)}"
+                )
+        lengths = np.linalg.norm(np.array(self.parameters.starts)[:, 3:], axis=1)
+        if np.abs(lengths - 1.0).max() > _UNIT:
+            raise CalibrationFileError(
+                "method_parameters.starts: expected unit quaternions, found one of length "
+                f"{lengths[np.abs(lengths - 1.0).argmax()]:g}"
+            )
 
     def solver(self, seen: SeenCamera | None) -> Solver | None:
         """As ``Head``: adds ``pose`` (1, 7), ``scale`` (1, 6, 6), ``signs`` (1, 2) and the rest.
@@ -137,12 +159,13 @@ class ScrHead(Head):
         seen = _stated(seen)
         pose_solver, limits = self._pose_solver(seen), self.parameters.limits
         # The scales that the network predicts have been calibrated for the learned camera only.
-        steps = 1 if seen.learned else _CONVERGED_STEPS
+        steps = (1,) if seen.learned else (1, _CONVERGED_STEPS)
         focal_px, cells = seen.camera.focal_px, math.prod(self.parameters.grid)
         count = max(1, round(min(BEST_CELLS, cells) * pose_solver.seen.mean()))
 
         def solve(outputs: Mapping[str, NDArray[Any]]) -> Solved:
-            scale_px = np.exp(outputs["log_scale_px"][0].astype(np.float64))
+            log_scale = outputs["log_scale_px"][0].astype(np.float64)
+            scale_px = np.exp(np.clip(log_scale, -_LARGEST_LOG, _LARGEST_LOG))
             points, scale = outputs["coordinates"][0], scale_px / focal_px
             found = pose_solver.solve(points, scale)
             lens = pose_solver.lens_evidence(points, scale, found.pose)
@@ -151,24 +174,27 @@ class ScrHead(Head):
             squared = found.squared[best]
             error_px = math.sqrt(np.median(squared * np.square(scale_px[best])))
             contradicting = np.count_nonzero(squared > _CONTRADICTS**2) / count
-            factor = dispersion(found.squared[pose_solver.seen], steps)
+            factor = max(dispersion(found.squared[pose_solver.seen], n) for n in steps)
             found = found._replace(information=found.information / factor)
             pose, information, added = self.combined(outputs, found, seen)
+            scale_of_errors = _lower_triangular(np.asarray(np.linalg.inv(information)))
             solved = {
                 **outputs,
                 **added,
                 "pose": pose[np.newaxis],
-                "scale": _lower_triangular(np.asarray(np.linalg.inv(information)))[np.newaxis],
+                "scale": scale_of_errors[np.newaxis],
                 "signs": np.array([[error_px, contradicting]]),
                 "solved_pose": found.pose[np.newaxis],
                 "lens_gradient": lens.gradient[np.newaxis],
                 "lens_information": lens.information[np.newaxis],
             }
+            # Written so that NaN is strange.
             strange = (
                 not found.last_step < _CONVERGED
+                or not np.isfinite(scale_of_errors).all()
                 or (
                     limits is not None
-                    and (error_px > limits.error_px or contradicting > limits.contradicting)
+                    and not (error_px <= limits.error_px and contradicting <= limits.contradicting)
                 )
                 or self.doubted(added)
             )
@@ -186,6 +212,12 @@ class ScrHead(Head):
         return CameraCheck(solver, focal_px, limits, signs.error_px, learned=seen.learned)
 
     def _pose_solver(self, seen: SeenCamera) -> PoseSolver:
+        rows, columns = self.parameters.grid
+        if seen.camera.height * columns != seen.camera.width * rows:
+            raise CalibrationFileError(
+                f"method_parameters.grid: expected square cells for an input of "
+                f"{seen.camera.width}x{seen.camera.height}, found {columns}x{rows}"
+            )
         rays = seen.rays(self.parameters.grid)
         solver = PoseSolver(
             rays, np.array(self.parameters.starts), np.array(self.parameters.damping)
@@ -194,8 +226,8 @@ class ScrHead(Head):
         if share < _LEAST_SEEN:
             raise UsageError(
                 f"camera: expected images that show at least {_LEAST_SEEN:.0%} of the model's "
-                f"cells, found {share:.0%}; its focal length or distortion is too far from that of "
-                "the bundle's camera"
+                f"cells, found {share:.0%}; give the intrinsics of the camera that takes the "
+                "images, or train with a camera of this kind"
             )
         return solver
 
@@ -297,7 +329,9 @@ class ScrHead(Head):
 
 def _stated(seen: SeenCamera | None) -> SeenCamera:
     if seen is None:
-        raise CalibrationFileError("camera: expected intrinsics for scr, found null")
+        raise CalibrationFileError(
+            "camera: expected intrinsics, which the solver needs, found null"
+        )
     return seen
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from cvo_edge.camera import Camera, cell_centres
@@ -18,8 +17,11 @@ from cvo_edge.vocabulary import Crop
 
 Array = NDArray[np.float64]
 
-# Cameras whose focal lengths and principal points differ by this share at most are the same.
+# Focal lengths that differ by this share at most are the same, and pixels, by this share of the
+# input's width.
 _SAME = 0.01
+# Rows and columns of pixels in which two cameras are compared.
+_PROBES = (12, 16)
 
 
 class Box(NamedTuple):
@@ -95,8 +97,8 @@ def crop_view(image_height: int, image_width: int, height: int, width: int, crop
 def matched_view(camera: Camera, learned: Camera, crop: Crop) -> View:
     """Return the view that shows a camera's images with the focal lengths of the learned camera.
 
-    ``learned`` is the camera whose images are the inputs that the network has learned. Without
-    need, the input is not padded: for nearly the same focal lengths, the image fills it.
+    ``learned`` is the camera whose images are the inputs that the network has learned. The input is
+    padded only if necessary: for nearly the same focal lengths, the image fills it.
     """
     height, width = learned.height, learned.width
     filled = crop_view(camera.height, camera.width, height, width, crop)
@@ -112,21 +114,23 @@ def seen_camera(camera: Camera, learned: Camera, crop: Crop) -> SeenCamera:
     """Return what the model sees of a camera; arguments as for ``matched_view``."""
     view = matched_view(camera, learned, crop)
     seen = view.camera(camera)
-    same = (
-        view.place.shape == (learned.height, learned.width)
-        and _similar(seen.fx, learned.fx)
-        and _similar(seen.fy, learned.fy)
-        and abs(seen.cx - learned.cx) <= _SAME * learned.width
-        and abs(seen.cy - learned.cy) <= _SAME * learned.height
-        and replace(seen, fx=learned.fx, fy=learned.fy, cx=learned.cx, cy=learned.cy) == learned
-    )
-    return SeenCamera(seen, view.place, same)
+    whole = view.place.shape == (learned.height, learned.width)
+    return SeenCamera(seen, view.place, whole and _same_rays(seen, learned))
 
 
 def _shown(cells: int, pixels: int, first: int, last: int) -> NDArray[np.bool_]:
     """Return which of the cells along one side lie between two of its pixels' edges."""
     edges = np.linspace(0.0, pixels, cells + 1)
     return np.asarray((edges[:-1] >= first) & (edges[1:] <= last))
+
+
+def _same_rays(seen: Camera, learned: Camera) -> bool:
+    """Whether both see the same, to a share of the input's width, wherever they see anything."""
+    pixels = cell_centres(learned.height, learned.width, _PROBES)
+    rays = learned.rays(pixels)
+    known = np.isfinite(rays).all(axis=1)
+    shown = seen.project(np.column_stack([rays[known], np.ones(known.sum())]))
+    return bool((np.abs(shown - pixels[known]) <= _SAME * learned.width).all())
 
 
 def _similar(a: float, b: float) -> bool:

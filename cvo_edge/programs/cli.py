@@ -161,7 +161,7 @@ def run(
     from cvo_edge.programs.run import run as run_frames
 
     written_as = format_of(output, format)
-    _refuse_overwriting(output, source, ground_truth, bundle, public_key)
+    _refuse_overwriting(output, source, ground_truth, bundle, public_key, camera)
     truth = open_ground_truth(ground_truth) if ground_truth else None
     frames = open_source(source, fps, timeout)
     with Odometer.load(

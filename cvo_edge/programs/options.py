@@ -47,7 +47,7 @@ CameraOption = Annotated[
     Path | None,
     typer.Option(
         "--camera",
-        help="JSON file with width, height, fx, fy, cx, cy of another camera (scr).",
+        help="JSON file with width, height, fx, fy, cx, cy of another camera (scr, fused).",
         readable=False,
         show_default=False,
         rich_help_panel="Input",

@@ -94,5 +94,5 @@ def test_a_wrong_camera_file_is_refused(tmp_path, content, problem):
 
 
 def test_a_missing_camera_file_is_refused(tmp_path):
-    with pytest.raises(UsageError, match=r"none.json: expected a camera file, found No such file"):
+    with pytest.raises(UsageError, match=r"none.json: no such file"):
         read_camera(tmp_path / "none.json")

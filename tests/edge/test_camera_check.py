@@ -21,7 +21,10 @@ START = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
 FOCAL_PX = 240.0
 # Without a verdict on pairs.
 NEVER = (1e6, 1e6, 1e6)
-LIMITS = LensLimits(log_focal=0.02, distortion=0.05, deviations=NEVER)
+# Of a recording: some have hardly moved and are no evidence.
+FRAMES = WINDOW + 10
+STEP = (1e-3, 1e-3)
+LIMITS = LensLimits(log_focal=0.02, distortion=0.05, deviations=NEVER, step=STEP)
 
 
 def grid_rays():
@@ -135,6 +138,23 @@ def test_what_two_frames_show_holds_for_a_window_of_others():
     assert not any(found[WINDOW:])
 
 
+def test_a_camera_that_stands_still_is_one_frame_of_evidence():
+    generator = np.random.default_rng(12)
+    stream = check(msgspec.structs.replace(LIMITS, deviations=(3.0, 3.0, 3.0)))
+    points, scale, pose = seen_by(np.array([0.1, 0.1, 0.0]), generator, noise=5e-4)
+    for _ in range(2 * WINDOW):
+        near = pose.copy()
+        near[:3] += generator.normal(0.0, 1e-4, 3)
+        assert not stream.differs(outputs_of(points, scale, near), familiar=True)
+
+
+def test_the_step_is_a_share_of_the_usual_motion():
+    outputs, sequence = known_frames([0.0, 0.0], np.random.default_rng(13))
+    for row in range(len(sequence)):
+        outputs["solved_pose"][row] = (0.04 * row, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    assert fitted_limits(outputs, sequence).step == pytest.approx((0.02, 1e-6))
+
+
 def test_deviations_are_those_of_the_lens_that_frames_show():
     """Over many frames of the known camera, they are those of a normal variable."""
     generator = np.random.default_rng(10)
@@ -184,20 +204,21 @@ def test_few_frames_show_no_camera():
 
 
 def known_frames(drifts, generator):
-    """Outputs of one window of frames per recording, whose cameras seem to differ by ``drifts``."""
+    """Outputs of some frames per recording, whose cameras seem to differ by ``drifts``."""
     frames = [
         outputs_of(*seen_by(np.array([drift, 0.0, 0.0]), generator))
         for drift in drifts
-        for _ in range(WINDOW)
+        for _ in range(FRAMES)
     ]
     stacked = {name: np.concatenate([each[name] for each in frames]) for name in frames[0]}
-    return stacked, np.repeat(np.arange(len(drifts)), WINDOW)
+    return stacked, np.repeat(np.arange(len(drifts)), FRAMES)
 
 
 def test_one_strange_recording_does_not_switch_the_check_off():
     generator = np.random.default_rng(5)
     limits = fitted_limits(*known_frames([0.002, 0.004, 0.006, 0.008, 0.3], generator))
     assert 0.006 < limits.log_focal < 0.03
+    assert max(limits.deviations) < 40.0
     assert msgspec.json.decode(msgspec.json.encode(limits), type=LensLimits) == limits
 
 
@@ -216,7 +237,7 @@ def test_limits_lie_beyond_the_known_recording():
 
 def test_recordings_without_a_window_of_evidence_give_no_limits():
     outputs, sequence = known_frames([0.0], np.random.default_rng(7))
-    outputs["signs"][0, 1] = 0.9
+    outputs["signs"][: FRAMES - WINDOW + 1, 1] = 0.9
     assert fitted_limits(outputs, sequence) is None
 
 
@@ -229,7 +250,7 @@ def test_frames_that_contradict_are_weak_evidence(contradicting, factor, differs
     frames = [outputs_of(*seen_by(np.array([0.03, 0.03, 0.0]), generator)) for _ in range(WINDOW)]
     evidence = [(each["lens_gradient"][0], each["lens_information"][0]) for each in frames]
     shown = np.abs(summed(evidence))
-    limits = LensLimits(float(shown[:2].max()) / factor, float(shown[2]) / factor, NEVER)
+    limits = LensLimits(float(shown[:2].max()) / factor, float(shown[2]) / factor, NEVER, STEP)
     stream = check(limits)
     for outputs in frames:
         outputs["signs"][0, 1] = contradicting

@@ -108,7 +108,7 @@ def test_points_of_no_place_are_doubted():
 
 
 def test_without_intrinsics_it_is_refused():
-    with pytest.raises(CalibrationFileError, match="camera: expected intrinsics for scr, found"):
+    with pytest.raises(CalibrationFileError, match="camera: expected intrinsics, which the solver"):
         ScrHead(PARAMETERS, "normalised").solver(None)
 
 

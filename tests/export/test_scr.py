@@ -280,8 +280,9 @@ def test_a_network_that_recognises_nothing_is_not_published(runs, tmp_path):
 @pytest.mark.parametrize(("frames", "copies"), [(100, 16), (2400, 16), (10_000, 7), (500_000, 1)])
 def test_large_data_sets_get_fewer_copies(monkeypatch, frames, copies):
     monkeypatch.setattr("cvo_export.training.configure.open_dataset", lambda _: range(frames))
-    assert _copies(TRAINABLE["scr"], "any") == copies
-    assert _copies(TRAINABLE["cjp"], "any") == 48
+    assert _copies(TRAINABLE["scr"], "any", 256 * 192) == copies
+    assert _copies(TRAINABLE["scr"], "any", 512 * 384) <= max(1, copies)
+    assert _copies(TRAINABLE["cjp"], "any", 256 * 192) == 48
 
 
 @pytest.mark.parametrize("rows", [1, 100, 65_536, 200_001])

@@ -153,7 +153,7 @@ def augmented(
     of the camera's.
     """
     turned_pose = pose.copy()
-    if camera is not None and config.rotation_deg > 0:
+    if camera is not None and (config.rotation_deg > 0 or zoom != 1.0):
         rotvec = np.deg2rad(config.rotation_deg) * generator.standard_normal(3)
         q_camera = geometry.quaternion_exp(rotvec)
         image = rotate_camera(image, camera, q_camera, zoom)

@@ -21,8 +21,8 @@ from cvo_export.training.options import option_name
 from cvo_export.training.run import TrainConfig
 from cvo_export.vocabulary import Normalisation
 
-# Images with their copies, for methods with cells; each takes 150 kB of memory at 256x192.
-_IMAGES_OF_CELLS = 40_000
+# Pixels of all images and their copies, for methods with cells: 40,000 of 256x192, 6 GB of memory.
+_PIXELS_OF_CELLS = 40_000 * 256 * 192
 
 
 def configure(
@@ -55,7 +55,9 @@ def configure(
     numbers: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     defaults = TRAINABLE[method]
     augment = {key: numbers.pop(key) for key in ("rotation_deg", "light") if key in numbers}
-    numbers = {"copies": _copies(defaults, dataset), "steps": defaults.steps, **numbers}
+    if "copies" not in numbers:
+        numbers["copies"] = _copies(defaults, dataset, width * height)
+    numbers = {"steps": defaults.steps, **numbers}
     kind = split or default_kind(open_dataset(dataset))
     return TrainConfig(
         dataset=dataset,
@@ -74,13 +76,13 @@ def configure(
     )
 
 
-def _copies(defaults: Method, dataset: str) -> int:
+def _copies(defaults: Method, dataset: str, pixels: int) -> int:
     """Return the default number of copies of each training image."""
     if not defaults.cells:
         return defaults.copies
     shares = SHARES["training"]
     images = max(1.0, (shares["train"] + shares["fit"]) * len(open_dataset(dataset)))
-    return min(defaults.copies, max(1, int(_IMAGES_OF_CELLS / images) - 1))
+    return min(defaults.copies, max(1, int(_PIXELS_OF_CELLS / pixels / images) - 1))
 
 
 def head_config(method: str, options: dict[str, Any]) -> Struct:

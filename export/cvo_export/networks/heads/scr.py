@@ -199,7 +199,7 @@ def cell_loss(
     prior = y[:, DEPTH_WEIGHT] * (torch.log(depth) - y[:, LOG_DEPTH]).abs()
     target = torch.cat([ray, torch.ones_like(ray[:, :1])], 1) * torch.exp(y[:, LOG_DEPTH, None])
     distance = (in_camera - target).norm(dim=1) / typical_depth
-    # Larger than any usable cell's loss, so that becoming usable pays.
+    # As large as the loss of a usable cell that is vague; it pulls the point to where it is seen.
     lost = 2.0 * np.log(focal_px) + 4.0 * distance
     value = shown * torch.where(usable, likelihood + prior, lost)
     return value.sum() / shown.sum().clamp(min=1.0)
