@@ -27,7 +27,7 @@ from cvo_edge.bundle.format import (
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageError
 from cvo_edge.geometry import mean_rotation
-from cvo_edge.heads import Candidate
+from cvo_edge.heads import HEADS, Candidate
 from cvo_edge.heads.cqr import CqrParameters
 from cvo_edge.vocabulary import Crop, Joint, Provider, Rule, Sides, SplitKind
 from cvo_export.bundles.draft import (
@@ -122,6 +122,8 @@ def calibrate(
     if rule is None:
         rule = "hierarchical" if split.kind == "sequence" else "pooled"
     own = provider or draft.model.provider
+    # A solver's network recognises the place as the camera of its training shows it.
+    solves = HEADS[draft.method].solves
     made = {**draft.provenance.created_with, **versions((*_PACKAGES, own))}
     draft = replace(
         draft,
@@ -130,7 +132,8 @@ def calibrate(
         joint=joint,
         split=split.spec(dataset),
         dataset=dataset.name,
-        camera=dataset.camera() or draft.camera,
+        camera=draft.camera if solves else dataset.camera() or draft.camera,
+        running=dataset.camera() if solves else None,
         model=msgspec.structs.replace(draft.model, provider=own),
         provenance=msgspec.structs.replace(draft.provenance, created_with=made),
     )

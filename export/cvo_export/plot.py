@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Calibration
+from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.files import whole_file
@@ -116,7 +117,9 @@ def track(
 
     Raises UsageError for an unknown sequence and SourceError if no frame has a pose.
     """
-    with Odometer.load(bundle_dir, confidence=confidence, scope=scope) as odometer:
+    bundle = read_bundle(bundle_dir)
+    camera = dataset.camera() if bundle.head.solves else None
+    with Odometer(bundle, confidence=confidence, scope=scope, camera=camera) as odometer:
         indices = subset_indices(odometer.calibration, dataset, subset)
         if sequence is not None:
             if sequence not in dataset.sequence_names:

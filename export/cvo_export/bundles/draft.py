@@ -81,9 +81,12 @@ class Draft:
     method
         Name of the runtime head.
     camera
-        The camera of the calibration images; None if it is unknown.
+        The camera that the bundle states, for a solver that of the training images; None if it is
+        unknown.
     rule, joint, split, dataset
         How to compute the thresholds, and from which frames.
+    running
+        The camera of the calibration images, if it is not ``camera``.
     """
 
     name: str
@@ -97,6 +100,7 @@ class Draft:
     joint: Joint
     split: SplitSpec
     dataset: str
+    running: Camera | None = None
 
     @classmethod
     def of(cls, calibration: Calibration) -> Draft:
@@ -125,9 +129,13 @@ class Draft:
         check_tensors(self.model, head)
         return head
 
-    def observer(self, model_bytes: bytes, head: Head) -> Observer:
-        """Return an observer that runs the network; raises ModelError and BundleMismatchError."""
-        return Observer(model_bytes, self.model, self.preprocess, self.pose, head, self.camera)
+    def observer(self, model_bytes: bytes, head: Head, *, stated: bool = False) -> Observer:
+        """Return an observer that runs the network; raises ModelError and BundleMismatchError.
+
+        ``stated``: for images of the camera that the bundle states, instead of the running one.
+        """
+        cameras = self.camera, None if stated else self.running
+        return Observer(model_bytes, self.model, self.preprocess, self.pose, head, *cameras)
 
     def calibrated(
         self,

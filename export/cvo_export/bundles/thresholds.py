@@ -172,11 +172,12 @@ def calibrated(
         for candidate in candidates
     ]
     head = draft.head(chosen(draft, val, candidates))
-    with draft.observer(model_bytes, head) as observer:
-        if head.solves:
-            # What was tuned may have changed what the solver finds.
+    if head.solves:
+        # What was tuned may have changed what the solver finds.
+        with draft.observer(model_bytes, head) as observer:
             val = observe(observer, dataset, roles["val"])
             cal = observe(observer, dataset, roles["cal"])
+    with draft.observer(model_bytes, head, stated=True) as observer:
         outputs = observe_selftest(observer, *SELFTEST_SIZE).outputs
     selftest = {
         spec.name: tuple(float(f"{value:.9g}") for value in outputs[spec.name].reshape(-1).tolist())
