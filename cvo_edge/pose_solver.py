@@ -9,7 +9,7 @@ errors e_i = pi(R^T (X_i - t)) - ray_i:
 
 The first steps are reweighted Gauss-Newton steps with enlarged scales, which fall to 1 (graduated
 non-convexity, Blake and Zisserman 1987), so that a distant start sees a smooth valley; the last are
-Newton steps. Nothing is drawn at random: RANSAC would turn rounding errors of 1e-6 into other
+Newton steps, without the projection's own curvature. Nothing is drawn at random: RANSAC would turn rounding errors of 1e-6 into other
 inliers and poses centimetres away, so two processors would disagree.
 """
 
@@ -49,8 +49,8 @@ class Solution(NamedTuple):
     pose
         Shape (7,): tx ty tz qx qy qz qw of ``T_world_camera``, unit quaternion, qw >= 0.
     information
-        Shape (6, 6), positive definite: curvature of the loss, an inverse covariance of
-        (t - t_hat, Log(R_hat^T R)), 1/m and 1/rad.
+        Shape (6, 6), positive definite: curvature of the loss and of the damping, an inverse
+        covariance of (t - t_hat, Log(R_hat^T R)), 1/m and 1/rad.
     squared
         Shape (n,): each cell's squared reprojection error in units of its scale.
     last_step

@@ -5,7 +5,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from cvo_edge.camera import Camera, cell_centres, read_camera
+from cvo_edge.camera import Camera, cell_centres, checked_camera, read_camera
 from cvo_edge.errors import UsageError
 
 PINHOLE = Camera(width=640, height=480, fx=585.0, fy=580.0, cx=320.0, cy=240.0)
@@ -57,6 +57,52 @@ def test_a_pixel_beyond_the_lens_model_has_no_ray():
     rays = steep.rays([[320.0, 240.0], [320.0 + 0.7 * 585.0, 240.0], [320.0 + 0.9 * 585.0, 240.0]])
     assert np.isfinite(rays[:2]).all()
     assert np.isnan(rays[2]).all()
+
+
+def test_a_pixel_beyond_the_fold_has_no_ray_of_the_far_branch():
+    """r (1 - .4 r^2 + .05 r^4) has its first maximum, .651, at r = 1.03, and rises again."""
+    folded = msgspec.structs.replace(
+        PINHOLE, fx=500.0, distortion="radial_tangential", coefficients=(-0.4, 0.05, 0.0, 0.0)
+    )
+    radii = np.array([0.5, 0.64, 0.66, 0.9])
+    rays = folded.rays(np.column_stack([320.0 + 500.0 * radii, np.full(4, 240.0)]))
+    np.testing.assert_array_equal(np.isfinite(rays[:, 0]), [True, True, False, False])
+    assert rays[1, 0] < 1.03
+
+
+def test_lenses_that_no_camera_has_give_no_rays():
+    generator = np.random.default_rng(1)
+    pixels = generator.uniform((0, 0), (639, 479), (50, 2))
+    for _ in range(100):
+        for camera, count in ((FISHEYE, 4), (RATIONAL, 8)):
+            absurd = tuple(generator.normal(0.0, 10.0 ** generator.uniform(-1, 4), count).tolist())
+            rays = msgspec.structs.replace(camera, coefficients=absurd).rays(pixels)
+            assert rays.shape == (50, 2)
+
+
+@pytest.mark.parametrize(
+    ("camera", "problem"),
+    [
+        ({"width": 640}, "expected a Camera, found dict"),
+        (msgspec.structs.replace(PINHOLE, fx=0.0), "expected the intrinsics .* > 0"),
+        (msgspec.structs.replace(PINHOLE, fx=float("nan")), "expected the intrinsics"),
+        (msgspec.structs.replace(PINHOLE, width=1, height=1), "at least 16 pixels .* found 1x1"),
+        (msgspec.structs.replace(PINHOLE, cx=9e5), "expected cx from -640 to 1280 pixels"),
+    ],
+)
+def test_what_cannot_be_a_camera_is_refused(camera, problem):
+    with pytest.raises(UsageError, match=f"camera: .*{problem}"):
+        checked_camera(camera)
+
+
+def test_a_camera_file_that_is_no_text_or_never_ends_is_refused(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_bytes(b'{"width": "\xff\xfe"}')
+    with pytest.raises(UsageError, match=r"camera.json: expected JSON"):
+        read_camera(path)
+    path.write_bytes(b" " * 100_000)
+    with pytest.raises(UsageError, match=r"camera.json: expected at most 65536 bytes"):
+        read_camera(path)
 
 
 def test_cell_centres_are_the_means_of_their_pixels():

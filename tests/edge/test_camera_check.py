@@ -110,6 +110,16 @@ def test_a_window_of_frames_shows_five_percent(lens):
     assert set(found[WINDOW - 1 :]) == {any(lens)}
 
 
+@pytest.mark.parametrize(("learned", "differs"), [(True, True), (False, False)])
+def test_a_camera_that_was_stated_has_wider_limits(learned, differs):
+    generator = np.random.default_rng(14)
+    frames = [outputs_of(*seen_by(np.array([0.03, 0.03, 0.0]), generator)) for _ in range(WINDOW)]
+    evidence = [(each["lens_gradient"][0], each["lens_information"][0]) for each in frames]
+    largest = float(np.abs(summed(evidence)).max())
+    stream = check(LensLimits(largest / 1.5, largest / 1.5, NEVER, STEP), learned=learned)
+    assert [stream.differs(each, familiar=True) for each in frames][-1] == differs
+
+
 @pytest.mark.parametrize(
     ("drift", "learned", "differs"),
     [(0.0, True, False), (0.1, True, True), (0.1, False, True), (0.01, False, False)],

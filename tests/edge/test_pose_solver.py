@@ -162,3 +162,60 @@ def test_the_dispersion_is_the_factor_of_the_squared_scales(factor):
         options={"xatol": 1e-6},
     )
     assert dispersion(squared, 60) == pytest.approx(of_scipy.x, rel=1e-3)
+
+
+def test_cells_without_a_ray_have_no_part_in_what_is_said_of_the_camera():
+    generator = np.random.default_rng(20)
+    truth = pose_near(generator)
+    points, scale = points_of(truth, generator, 0.5), np.full(len(RAYS), 1.0 / CAMERA.fx)
+    identity = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    shown = np.arange(len(RAYS)) % 3 > 0
+    some = PoseSolver(np.where(shown[:, np.newaxis], RAYS, np.nan), identity, DEVIATION)
+    fewer = PoseSolver(RAYS[shown], identity, DEVIATION)
+    pose = some.solve(points, scale).pose
+    np.testing.assert_allclose(pose, fewer.solve(points[shown], scale[shown]).pose, atol=1e-12)
+    for found, expected in zip(
+        some.lens_evidence(points, scale, pose),
+        fewer.lens_evidence(points[shown], scale[shown], pose),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+    lens, error = some.lens_fit([(points, scale, pose)])
+    expected = fewer.lens_fit([(points[shown], scale[shown], pose)])
+    np.testing.assert_allclose(lens, expected.lens, atol=1e-9)
+    np.testing.assert_allclose(error, expected.error, atol=1e-9)
+
+
+def test_points_behind_the_camera_contradict_it():
+    generator = np.random.default_rng(21)
+    truth = pose_near(generator)
+    points = points_of(truth, generator)
+    R = geometry.quaternion_to_matrix(truth[3:])
+    behind = np.column_stack([RAYS[:80], np.full(80, -3.0)])
+    points[:80] = behind @ R.T + truth[:3]
+    found = solver().solve(points, np.full(len(RAYS), 1.0 / CAMERA.fx))
+    assert (found.squared[:80] > 1e3).all()
+    assert (found.squared[80:] < 1.0).all()
+
+
+@pytest.mark.parametrize("deviation", [1e-3, 1e-2, 1.0])
+def test_a_place_that_was_seen_from_one_height_is_solved(deviation):
+    generator = np.random.default_rng(22)
+    damping = np.array([0.5, 0.5, 3.0 * deviation, 0.4, 0.4, 0.4])
+    identity = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    for _ in range(20):
+        truth = pose_near(generator)
+        found = PoseSolver(RAYS, identity, damping).solve(
+            points_of(truth, generator, 0.3), np.full(len(RAYS), 0.3 / CAMERA.fx)
+        )
+        assert found.last_step < 0.05
+        assert np.linalg.norm(found.pose[:3] - truth[:3]) < 0.02
+
+
+def test_a_solver_that_is_held_back_has_not_converged():
+    generator = np.random.default_rng(23)
+    truth = pose_near(generator)
+    identity = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    held = PoseSolver(RAYS, identity, np.full(6, 1e-6))
+    found = held.solve(points_of(truth, generator, 0.3), np.full(len(RAYS), 0.3 / CAMERA.fx))
+    assert not found.last_step < 1.0

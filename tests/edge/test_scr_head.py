@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from cvo_edge import geometry
 from cvo_edge.bundle.format import Threshold
@@ -19,6 +20,7 @@ CAMERA = Camera(width=640, height=480, fx=585.0, fy=585.0, cx=319.5, cy=239.5)
 FISHEYE = msgspec.structs.replace(
     CAMERA, fx=300.0, fy=300.0, distortion="equidistant", coefficients=(0.01, 0.0, 0.0, 0.0)
 )
+OTHER = CAMERA.zoomed(1.1)
 GRID = (12, 16)
 PARAMETERS = ScrParameters(
     grid=GRID,
@@ -97,6 +99,88 @@ def test_a_camera_that_shows_too_little_is_refused():
         head.solver(seen(CAMERA.zoomed(2.4)))
 
 
+def test_a_frame_that_errs_more_than_it_says_is_less_certain():
+    """Errors three times as large count more for a camera that the network has not learned."""
+    ratios = []
+    for camera in (CAMERA, OTHER):
+        deviations = []
+        for factor in (1.0, 3.0):
+            generator = np.random.default_rng(7)
+            outputs = outputs_of(camera, pose_near(generator), generator, noise_px=0.2 * factor)
+            outputs["log_scale_px"][:] = np.log(0.2)
+            solve = ScrHead(PARAMETERS, "normalised").solver(seen(camera))
+            deviations.append(np.sqrt(np.square(solve(outputs).outputs["scale"][0]).sum(axis=1)))
+        ratios.append(deviations[1] / deviations[0])
+    # The weights alone widen it 1.7 times.
+    assert (ratios[0] > 2.3).all()
+    assert (ratios[1] > 1.3 * ratios[0]).all()
+
+
+@pytest.mark.parametrize("camera", [CAMERA, CAMERA.zoomed(1.6)])
+def test_the_signs_look_at_the_best_cells_of_those_that_show_the_image(camera):
+    generator = np.random.default_rng(8)
+    outputs = outputs_of(camera, pose_near(generator), generator)
+    shown = np.flatnonzero(np.isfinite(seen(camera).rays(GRID)[:, 0]))
+    # Nearly half of the cells are wrong, and say that they are vague.
+    wrong = shown[: int(0.4 * len(shown))]
+    outputs["coordinates"][0, wrong] += np.float32(50.0)
+    outputs["log_scale_px"][0, wrong] = np.log(5.0)
+    found = ScrHead(PARAMETERS, "normalised").solver(seen(camera))(outputs)
+    error_px, contradicting = found.outputs["signs"][0]
+    assert contradicting < 0.2
+    assert error_px < 1.0
+    assert found.doubt is None
+
+
+def test_cells_that_are_vague_are_doubted_even_if_they_say_so():
+    generator = np.random.default_rng(9)
+    head = ScrHead(PARAMETERS, "normalised")
+    outputs = outputs_of(CAMERA, pose_near(generator), generator, noise_px=8.0)
+    found = head.solver(seen(CAMERA))(outputs)
+    assert found.outputs["signs"][0, 1] < PARAMETERS.limits.contradicting
+    assert found.doubt is Reason.IMAGE_UNFAMILIAR
+
+
+def test_without_limits_a_solver_that_has_not_converged_is_doubted():
+    generator = np.random.default_rng(10)
+    head = ScrHead(msgspec.structs.replace(PARAMETERS, limits=None), "normalised")
+    solve = head.solver(seen(CAMERA))
+    points = generator.normal(0.0, 2.0, (20, 1, 192, 3)).astype(np.float32)
+    logs = np.zeros((1, 192), np.float32)
+    doubts = [solve({"coordinates": each, "log_scale_px": logs}).doubt for each in points]
+    assert doubts.count(Reason.IMAGE_UNFAMILIAR) > 10
+
+
+@pytest.mark.parametrize("log_scale", [1e4, -1e4, np.log(0.5)])
+def test_absurd_scales_are_doubted_and_give_numbers(log_scale):
+    generator = np.random.default_rng(11)
+    outputs = outputs_of(CAMERA, pose_near(generator), generator)
+    outputs["log_scale_px"][:] = log_scale
+    found = ScrHead(PARAMETERS, "normalised").solver(seen(CAMERA))(outputs)
+    assert np.isfinite(found.outputs["signs"]).all()
+    assert (found.doubt is None) == (log_scale == np.log(0.5))
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"starts": ((0.0,) * 7,)}, "starts: expected unit quaternions, found one of length 0"),
+        ({"damping": (1e-300,) * 6}, "damping: expected 1e-07 to 1e\\+06, found"),
+        ({"deviation_floor": (1e-300,) * 6}, "deviation_floor: expected 1e-07 to"),
+    ],
+)
+def test_parameters_that_no_solver_works_with_are_refused(changes, problem):
+    head = ScrHead(msgspec.structs.replace(PARAMETERS, **changes), "normalised")
+    with pytest.raises(CalibrationFileError, match=problem):
+        head.check((), "max")
+
+
+def test_cells_that_are_not_square_are_refused():
+    head = ScrHead(msgspec.structs.replace(PARAMETERS, grid=(16, 12)), "normalised")
+    with pytest.raises(CalibrationFileError, match="grid: expected square cells"):
+        head.solver(seen(CAMERA))
+
+
 def test_points_of_no_place_are_doubted():
     generator = np.random.default_rng(0)
     solve = ScrHead(PARAMETERS, "normalised").solver(seen(CAMERA))
@@ -128,17 +212,19 @@ def test_limits_accept_every_known_frame():
     assert tuned.candidates()[0].parameters.limits is None
 
 
+@pytest.mark.parametrize("floor", [1e-4, 0.02])
 @pytest.mark.parametrize("scope", ["marginal", "joint"])
-def test_the_set_holds_exactly_the_poses_with_a_smaller_score(scope):
+def test_the_set_holds_exactly_the_poses_with_a_smaller_score(scope, floor):
     generator = np.random.default_rng(1)
-    head = ScrHead(PARAMETERS, "normalised")
+    parameters = msgspec.structs.replace(PARAMETERS, deviation_floor=(floor,) * 6)
+    head = ScrHead(parameters, "normalised")
     solve = head.solver(seen(CAMERA))
     point = np.zeros(6)
     threshold = Threshold(confidence=0.9, scope=scope, q_hat=(2.0,) * 6, q_hat_upper=None)
     for _ in range(50):
         outputs = solve(outputs_of(CAMERA, pose_near(generator), generator)).outputs
         found = head.conformal_set(outputs, point, threshold)
-        deviation = np.sqrt(np.square(outputs["scale"][0]).sum(axis=1))
+        deviation = np.maximum(np.sqrt(np.square(outputs["scale"][0]).sum(axis=1)), floor)
         y = point + generator.normal(0.0, 1.5, 6) * deviation
         scores = head.scores(outputs, point[np.newaxis], y[np.newaxis], scope)[0, 0]
         if scope == "marginal":
@@ -225,6 +311,44 @@ def test_disagreement_beyond_that_of_known_frames_is_a_doubt():
     for frame in frames:
         frame["regression"] = frame["regression"] + np.float32([0.3, 0, 0, 0, 0, 0, 0])
         assert solve(frame).doubt is Reason.IMAGE_UNFAMILIAR
+
+
+def test_the_fused_pose_minimises_the_sum_of_both_losses():
+    generator = np.random.default_rng(12)
+    root = generator.normal(0.0, 30.0, (6, 6))
+    information = root @ root.T + 100.0 * np.eye(6)
+    half_width = generator.uniform(0.01, 0.05, 6)
+    fusion = Fusion(kappa=0.3, rho=tuple(generator.uniform(0.5, 2.0, 6).tolist()), share=0.7)
+    solved = pose_near(generator)
+    regression = regression_of(solved, generator, np.full(6, 0.02))
+    offset = error(regression, solved)
+
+    def loss(e):
+        apart = (e - offset) / (np.array(fusion.rho) * half_width)
+        return fusion.kappa * e @ information @ e + fusion.share * apart @ apart
+
+    oracle = minimize(loss, np.zeros(6), method="BFGS", options={"gtol": 1e-9})
+    pose, found, disagreement = fused(solved, information, regression, half_width, fusion)
+    np.testing.assert_allclose(error(pose, solved), oracle.x, atol=1e-5)
+    assert disagreement == pytest.approx(oracle.fun / 6.0, rel=1e-3)
+    weight = fusion.share / np.square(np.array(fusion.rho) * half_width)
+    expected = (fusion.kappa * information + np.diag(weight)) / max(1.0, disagreement)
+    np.testing.assert_allclose(found, expected)
+
+
+def test_the_solver_alone_is_as_certain_as_val_has_shown():
+    generator = np.random.default_rng(13)
+    fusion = Fusion(kappa=0.04, rho=(1.0,) * 6, share=1.0)
+    outputs = outputs_of(OTHER, pose_near(generator), generator)
+    outputs["regression"] = np.zeros((1, 7), np.float32) + np.float32([0, 0, 0, 0, 0, 0, 1])
+    outputs["half_width"] = np.full((1, 6), 0.01, np.float32)
+    scales = [
+        FusedHead(msgspec.structs.replace(FUSED, fusion=each), "normalised")
+        .solver(seen(OTHER))(outputs)
+        .outputs["scale"]
+        for each in (None, fusion)
+    ]
+    np.testing.assert_allclose(scales[1], scales[0] / np.sqrt(0.04))
 
 
 def test_disagreement_widens_the_covariance():
