@@ -9,8 +9,9 @@ errors e_i = pi(R^T (X_i - t)) - ray_i:
 
 The first steps are reweighted Gauss-Newton steps with enlarged scales, which fall to 1 (graduated
 non-convexity, Blake and Zisserman 1987), so that a distant start sees a smooth valley; the last are
-Newton steps, without the projection's own curvature. Nothing is drawn at random: RANSAC would turn rounding errors of 1e-6 into other
-inliers and poses centimetres away, so two processors would disagree.
+Newton steps, without the projection's own curvature. Nothing is drawn at random: RANSAC would turn
+rounding errors of 1e-6 into other inliers and poses centimetres away, so two processors would
+disagree.
 """
 
 from __future__ import annotations
