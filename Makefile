@@ -7,7 +7,7 @@ DEMO_VENV := .venv-demo
 DOCS_VENV := .venv-docs
 RELEASE_VENV := .venv-release
 LOWEST_VENV := .venv-lowest
-METHODS := cjp cqr csp mcqr
+METHODS := scr cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 RUNTIME := $(shell find cvo_edge -type f -not -name "*.pyc")
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from markdown_table import table
-from networks import METHODS, demonstration
+from networks import DEMONSTRATED, METHODS, demonstration
 from provenance import read_result, result_files
 
 RECORDINGS = ("redkitchen", "kitchen_flights")
@@ -228,7 +228,7 @@ def demonstrations(precision: str) -> str:
         ),
     ]
     rows: list[list[str]] = []
-    for method in METHODS:
+    for method in DEMONSTRATED:
         report = read_result("demonstrations", demonstration(method, precision).name)
         error = report["point_error"]
         point = f"{100 * error['median_m']:.2f} cm {error['median_deg']:.2f} deg"

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 
-from networks import ARTIFACTS, METHODS, PRECISIONS, demonstration
+from networks import ARTIFACTS, DEMONSTRATED, PRECISIONS, demonstration
 from provenance import RESULTS, write_result
 
 from cvo_export.datasets import open_dataset
@@ -22,7 +22,7 @@ DATASET = "synthetic:room,flights=100"
 
 def main() -> None:
     """Evaluate each bundle, print its table, write its figures."""
-    bundles = [demonstration(method, p) for p in PRECISIONS for method in METHODS]
+    bundles = [demonstration(method, p) for p in PRECISIONS for method in DEMONSTRATED]
     if sys.argv[1:]:
         bundles = [ARTIFACTS / name for name in sys.argv[1:]]
     dataset = open_dataset(DATASET)

@@ -27,6 +27,8 @@ ROOT = Path(__file__).resolve().parent.parent
 WORK = ROOT / "build" / "bench"
 ARTIFACTS = ROOT / "calibration_artifacts"
 METHODS = ("cjp", "cqr", "csp", "mcqr")
+# Those with a demonstration bundle; SCR has no form with a whole backbone.
+DEMONSTRATED = ("scr", *METHODS)
 BACKBONES = ("mobilenetv2_100", "resnet34")
 PRECISIONS = ("fp32", "int8")
 ROOM = "synthetic:room,flights=20,frames=20"

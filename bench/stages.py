@@ -14,7 +14,7 @@ from time import perf_counter
 
 import cv2
 import numpy as np
-from networks import METHODS, demonstration, frames, images
+from networks import DEMONSTRATED, demonstration, frames, images
 
 from cvo_edge.input import preprocess
 from cvo_edge.input.decoding import decode_image
@@ -51,7 +51,7 @@ def median_us(call: Callable[[], object]) -> float:
 
 def main() -> None:
     """Print both."""
-    for method in METHODS:
+    for method in DEMONSTRATED:
         row = stages(method)
         print(method, ", ".join(f"{name} {us:.0f} us" for name, us in row.items()), flush=True)
     picture, content = images()[0], frames()[0].read_bytes()

@@ -113,8 +113,8 @@ class CameraCheck:
         self._familiar: deque[Evidence] = deque(maxlen=WINDOW)
         self._kept: list[tuple[Array, Array, Array]] = []
         self._seen, self._stride = 0, 1
-        # Number of clear frames for which the verdict of two frames still holds.
-        self._held = 0
+        # The verdict of whole windows, and for how many frames that of two still holds.
+        self._differs, self._held = False, 0
 
     def differs(self, outputs: Mapping[str, NDArray[Any]], *, familiar: bool) -> bool:
         """Add one frame; return whether the frames of the stream show another camera.
@@ -133,20 +133,27 @@ class CameraCheck:
             self._familiar.append(evidence)
             if _is_clear(outputs["signs"])[0]:
                 self._clear.append(evidence)
-                self._held = WINDOW if self._pair_differs() else max(0, self._held - 1)
-        return self._held > 0 or any(
-            len(window) == WINDOW and (np.abs(summed(list(window))) > factor * self._limits).any()
-            for window, factor in ((self._clear, 1.0), (self._familiar, _WEAK))
-        )
+            windows = (self._clear, 1.0), (self._familiar, _WEAK)
+            shown = any(self._pair_differs(*each) for each in windows)
+            self._held = WINDOW if shown else max(0, self._held - 1)
+            self._differs = any(self._window_differs(*each) for each in windows)
+        return self._differs or self._held > 0
 
-    def _pair_differs(self) -> bool:
-        """Whether the last two clear frames show a lens that is off by too many deviations."""
-        if len(self._clear) < PAIR:
+    def _window_differs(self, window: deque[Evidence], factor: float) -> bool:
+        if len(window) < WINDOW:
             return False
-        pair = [self._clear[-2], self._clear[-1]]
-        beyond = np.abs(summed(pair)) > self._limits
+        return bool((np.abs(summed(list(window))) > factor * self._limits).any())
+
+    def _pair_differs(self, window: deque[Evidence], factor: float) -> bool:
+        """Whether the last two frames show a lens that is off by too many deviations."""
+        if len(window) < PAIR:
+            return False
+        pair = [window[-2], window[-1]]
+        beyond = np.abs(summed(pair)) > factor * self._limits
         # Few frames come this far, so that the covariance costs nothing.
-        return bool(beyond.any() and (beyond & (in_deviations(pair) > self._deviations)).any())
+        return bool(
+            beyond.any() and (beyond & (in_deviations(pair) > factor * self._deviations)).any()
+        )
 
     def estimate(self) -> LensEstimate | None:
         """Return the camera that the frames show; None if none explains them, or for few frames."""

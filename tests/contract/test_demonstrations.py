@@ -11,7 +11,7 @@ from cvo_edge.ground_truth import open_ground_truth
 from cvo_edge.programs.selftest import check_selftest
 
 ARTIFACTS = Path(__file__).resolve().parents[2] / "calibration_artifacts"
-METHODS = ["cjp", "cqr", "csp", "mcqr"]
+METHODS = ["scr", "cjp", "cqr", "csp", "mcqr"]
 NAMES = [f"{method}{suffix}" for method in METHODS for suffix in ("", "-int8")]
 
 
