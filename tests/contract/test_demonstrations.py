@@ -40,7 +40,8 @@ def test_eight_bits_cost_little_and_the_file_is_smaller(method, clip_dir):
             np.mean([e.conformal_set.width() for e in odometer.stream(frames)], axis=0)
             for odometer in (first, second)
         ]
-    assert np.mean(widths[1] / widths[0]) < 1.1
+    # Rounding shows in intervals of half a centimetre.
+    assert np.mean(widths[1] / widths[0]) < (1.3 if method == "scr" else 1.1)
 
 
 def test_it_is_small_enough_for_a_repository(demonstration):
@@ -58,6 +59,23 @@ def test_the_clip_is_covered_about_as_often_as_stated(demonstration, clip_dir, s
     assert all(estimate.bounded for estimate in estimates)
     covered = np.array([estimate.covers(truth.pose_of(estimate)) for estimate in estimates])
     assert covered.mean() > 0.75
+
+
+@pytest.mark.parametrize("precision", ["", "-int8"])
+def test_a_solver_gives_the_same_bits_again_and_with_more_threads(precision, clip_dir):
+    frames = list(open_source(str(clip_dir)))[:20]
+    runs = []
+    for threads in (1, 2, 1):
+        with Odometer.load(
+            ARTIFACTS / f"synthetic-room-scr{precision}", threads=threads
+        ) as odometer:
+            runs.append(
+                [
+                    (each.pose.to_array().tolist(), each.lower.tolist(), each.upper.tolist())
+                    for each in odometer.stream(frames)
+                ]
+            )
+    assert runs[0] == runs[1] == runs[2]
 
 
 @pytest.mark.whole_clip

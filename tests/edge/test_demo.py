@@ -41,7 +41,7 @@ def test_it_needs_nothing_but_the_package_and_leaves_nothing_but_a_picture(tmp_p
     done = run_demo(tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
-    assert lines[0].startswith("synthetic-room-cjp-int8: digests match")
+    assert lines[0].startswith("synthetic-room-scr-int8: digests match")
     shown = [line.split()[0] for line in lines if line.startswith(("frame-", "..."))]
     assert shown == [*(f"frame-{number:06}" for number in range(4)), "..."]
     (coverage,) = [line for line in lines if line.startswith("coverage")]

@@ -43,7 +43,7 @@ def entry_folder(cache: ModelCache) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("method", ["cjp", "cqr", "csp", "mcqr", "cjp-int8"])
+@pytest.mark.parametrize("method", ["cjp", "cqr", "csp", "mcqr", "cjp-int8", "scr", "scr-int8"])
 def test_a_prepared_model_computes_the_very_same(method, bundle_dir, clip_dir, cache):
     folder = bundle_dir.with_name(f"synthetic-room-{method}")
     with (
