@@ -186,7 +186,7 @@ def workshop(tmp_path_factory, artifacts_dir) -> Workshop:
     done: list[list[str]] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        execute("README.md", "train", patch, done)
+        execute("docs/train.md", "train", patch, done)
     return Workshop(folder, done)
 
 

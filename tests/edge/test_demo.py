@@ -89,7 +89,7 @@ def test_every_demonstration_bundle_was_measured_and_no_other(artifacts_dir):
     measured = {digest: entry["name"] for digest, entry in report()["bundles"].items()}
     bundles = [file.parent for file in artifacts_dir.glob("*/calibration.json")]
     calibrations = [read_calibration(folder) for folder in bundles]
-    assert len(calibrations) == 8
+    assert len(calibrations) == 10
     assert measured == {each.digest: each.name for each in calibrations}
 
 
