@@ -185,6 +185,6 @@ def test_no_frame_that_passes_is_a_usage_error(tiny_bundle, tiny_run):
     blind = dataclasses.replace(tiny_run.dataset, read_image=lambda _: np.zeros((1, 1), np.uint8))
     with (
         Odometer.load(tiny_bundle) as odometer,
-        pytest.raises(SourceError, match="none of the 2 frames passes"),
+        pytest.raises(SourceError, match="found none of 2: image_unsupported 2"),
     ):
         observe(odometer, blind, np.array([0, 1]))
