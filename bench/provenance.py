@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -44,13 +45,14 @@ def command() -> str:
     """Return the command line of this process, with variables in place of this machine's folders.
 
     ``$CVO_DATA`` and ``$CVO_WEIGHTS`` stand for their values, a path within the repository is
-    relative to it, and the interpreter is called ``python``.
+    relative to it, of a path elsewhere only the name is kept, and the interpreter is called
+    ``python``.
     """
     words = " ".join(["python", *sys.orig_argv[1:]])
     for name in ("CVO_DATA", "CVO_WEIGHTS"):
         if os.environ.get(name):
             words = words.replace(os.environ[name], f"${name}")
-    return words.replace(f"{ROOT}/", "")
+    return re.sub(r"(?<!\S)/(?:[^\s/]+/)*", "", words.replace(f"{ROOT}/", ""))
 
 
 def commit() -> str:

@@ -38,7 +38,7 @@ _CONVERGED = 1e-9
 # Places between the optical axis and a ray where the lens must not turn the image back.
 _ALONG = 33
 # Smallest side of an image, largest camera file.
-_LEAST_SIDE, _LARGEST_FILE = 16, 64 * 1024
+LEAST_SIDE, _LARGEST_FILE = 16, 64 * 1024
 
 
 class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
@@ -181,9 +181,9 @@ def checked_camera(camera: object) -> Camera:
         checked = msgspec.convert(msgspec.to_builtins(camera), Camera)
     except (msgspec.ValidationError, TypeError, ValueError, KeyError) as error:
         raise UsageError(f"camera: expected the intrinsics of a camera, found: {error}") from None
-    if min(checked.width, checked.height) < _LEAST_SIDE:
+    if min(checked.width, checked.height) < LEAST_SIDE:
         raise UsageError(
-            f"camera: expected images of at least {_LEAST_SIDE} pixels a side, found "
+            f"camera: expected images of at least {LEAST_SIDE} pixels a side, found "
             f"{checked.width}x{checked.height}"
         )
     for name, length in (("cx", checked.width), ("cy", checked.height)):

@@ -12,12 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.camera import LEAST_SIDE
 from cvo_edge.input.view import View, crop_view
 from cvo_edge.vocabulary import Crop
 
 Image = NDArray[np.uint8]
-
-MIN_SIDE = 16
 
 
 def to_bgr8(image: object) -> Image | None:
@@ -28,7 +27,7 @@ def to_bgr8(image: object) -> Image | None:
     """
     if not isinstance(image, np.ndarray) or image.ndim not in (2, 3):
         return None
-    if min(image.shape[:2]) < MIN_SIDE:
+    if min(image.shape[:2]) < LEAST_SIDE:
         return None
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)

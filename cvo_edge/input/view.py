@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.camera import Camera, cell_centres
+from cvo_edge.camera import LEAST_SIDE, Camera, cell_centres
+from cvo_edge.errors import UsageError
 from cvo_edge.vocabulary import Crop
 
 Array = NDArray[np.float64]
@@ -111,8 +112,17 @@ def matched_view(camera: Camera, learned: Camera, crop: Crop) -> View:
 
 
 def seen_camera(camera: Camera, learned: Camera, crop: Crop) -> SeenCamera:
-    """Return what the model sees of a camera; arguments as for ``matched_view``."""
+    """Return what the model sees of a camera; arguments as for ``matched_view``.
+
+    Raises UsageError if that is less of its image than any image may be.
+    """
     view = matched_view(camera, learned, crop)
+    if min(view.part.shape) < LEAST_SIDE:
+        height, width = view.part.shape
+        raise UsageError(
+            f"camera: expected focal lengths with which the model sees {LEAST_SIDE} pixels a side or "
+            f"more, found {width}x{height} pixels with fx {camera.fx:g}, fy {camera.fy:g}"
+        )
     seen = view.camera(camera)
     whole = view.place.shape == (learned.height, learned.width)
     return SeenCamera(seen, view.place, whole and _same_rays(seen, learned))

@@ -146,6 +146,9 @@ def execute(page: str, kind: str, monkeypatch: pytest.MonkeyPatch, done: list[li
 
 def run_own(words: list[str]) -> None:
     program, name, *rest = words
+    if (name, rest[:1]) == ("train", ["scr"]):
+        # It takes minutes until SCR knows a place well enough to be published.
+        rest[0] = "cjp"
     arguments = [name, *rest, *SMALL.get((program, name), [])]
     try:
         with COMMANDS[program].make_context(program, arguments) as context:
@@ -186,7 +189,7 @@ def workshop(tmp_path_factory, artifacts_dir) -> Workshop:
     done: list[list[str]] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        execute("docs/train.md", "train", patch, done)
+        execute("README.md", "train", patch, done)
     return Workshop(folder, done)
 
 

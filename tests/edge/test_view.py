@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from cvo_edge.camera import Camera
+from cvo_edge.errors import UsageError
 from cvo_edge.input.preprocess import viewed
 from cvo_edge.input.view import crop_view, matched_view, seen_camera
 
@@ -68,6 +69,13 @@ def test_the_seen_camera_shows_a_ray_where_the_input_does(camera, ray):
     v, u = np.mgrid[:192, :256]
     centroid = np.array([(u * found).sum(), (v * found).sum()]) / found.sum()
     np.testing.assert_allclose(centroid, view.camera(camera).project(point)[0], atol=0.05)
+
+
+@pytest.mark.parametrize("focal", [0.5, 1e-5])
+def test_a_camera_of_which_the_model_would_see_a_few_pixels_is_refused(focal):
+    absurd = msgspec.structs.replace(CAMERA, fx=focal, fy=focal)
+    with pytest.raises(UsageError, match="more, found 1x1 pixels with fx"):
+        seen_camera(absurd, LEARNED, "none")
 
 
 def test_the_padding_repeats_the_edge():
