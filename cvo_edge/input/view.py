@@ -120,8 +120,8 @@ def seen_camera(camera: Camera, learned: Camera, crop: Crop) -> SeenCamera:
     if min(view.part.shape) < LEAST_SIDE:
         height, width = view.part.shape
         raise UsageError(
-            f"camera: expected focal lengths with which the model sees {LEAST_SIDE} pixels a side or "
-            f"more, found {width}x{height} pixels with fx {camera.fx:g}, fy {camera.fy:g}"
+            f"camera: expected focal lengths with which the model sees {LEAST_SIDE} pixels a side "
+            f"or more, found {width}x{height} pixels with fx {camera.fx:g}, fy {camera.fy:g}"
         )
     seen = view.camera(camera)
     whole = view.place.shape == (learned.height, learned.width)
