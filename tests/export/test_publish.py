@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from cvo_edge import Odometer, SinkError, SourceError
 from cvo_edge.bundle.format import CONFIDENCES
@@ -18,7 +19,7 @@ from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
 from cvo_edge.programs.selftest import check_selftest
 from cvo_export.bundles.thresholds import observe
-from cvo_export.graph.to_onnx import check_parity
+from cvo_export.graph.to_onnx import check_parity, export_onnx
 from cvo_export.networks.heads.cjp import CjpConfig, CjpLearner, CjpNetwork, CjpPrediction
 from cvo_export.publish import publish
 from cvo_export.training.loop import train
@@ -75,6 +76,31 @@ def test_torch_and_the_graph_agree_and_another_graph_does_not(tiny_bundle, tiny_
     other.head.decoder.mean += 1.0
     with pytest.raises(GateError, match="agree"):
         check_parity(other, session, [{"image": image}], ["image"])
+
+
+class _Scaled(nn.Module):
+    """x -> (scale x,): a graph with one output."""
+
+    def __init__(self, scale: float) -> None:
+        super().__init__()
+        self.register_buffer("scale", torch.tensor(scale))
+
+    def forward(self, x):
+        return (self.scale * x,)
+
+
+@pytest.mark.parametrize("size", [1.0, 1000.0])
+def test_parity_is_relative_to_the_size_of_an_output_above_one(size):
+    session = Session(export_onnx(_Scaled(size), [torch.ones((1, 1))], ["x"], ["y"]))
+    feed = {"x": np.ones((1, 1), np.float32)}
+
+    def difference(part: float) -> float:
+        return check_parity(_Scaled(size * (1.0 + part)), session, [feed], ["x"])
+
+    assert difference(5e-5) == pytest.approx(5e-5, rel=0.01)
+    for wrong in (2e-4, np.nan, np.inf):
+        with pytest.raises(GateError, match="agree"):
+            difference(wrong)
 
 
 def test_a_bundle_is_replaced_whole_and_anything_else_is_refused(tiny_run, tiny_bundle, tmp_path):
