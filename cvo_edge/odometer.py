@@ -347,6 +347,10 @@ class Odometer:
         """Run the network on one image without applying a threshold; see ``Observer.observe``."""
         return self._observer.observe(image_bgr, seq)
 
+    def solver_error(self) -> float:
+        """Return how wrong the method's solver is on this machine; see ``Head.solver_error``."""
+        return self._observer.solver_error()
+
     def conformal_set(
         self, observation: Observation, threshold: Threshold | None = None
     ) -> ConformalSet:

@@ -38,6 +38,8 @@ _LENS_STEPS, _LENS_PRECISION = 10, 1.0
 # Points closer to the image plane than this share of the damping deviation of the position, or
 # behind it, have no weight.
 _NEAR = 0.01
+# Scale of reprojection errors, normalised, for points that have none.
+_EXACT_SCALE = 0.01
 # Squared error in units of the scale of such points.
 _BEHIND = 1e6
 
@@ -106,6 +108,21 @@ class PoseSolver:
             R, t, found = self._step(R, t, X, spread, newton=True)
         pose = np.array([*t.tolist(), *_quaternion(*R.ravel().tolist())])
         return Solution(pose, _in_world(found.information, R), found.squared, self._length(found))
+
+    def error_on_exact_points(self) -> float:
+        """Return the error of the pose that is found for points of a known pose near a start.
+
+        The largest of its position errors, in mean deviations of the damping, and its rotation
+        error, in rad: rounding only, unless this machine computes wrongly.
+        """
+        reach, rays = self._near / _NEAR, self._rays
+        R, t = _moved(self._R[0], self._t[0], np.array([*(0.1 * reach,) * 3, *(0.05,) * 3]))
+        depth = reach * (2.0 + np.sin(np.arange(rays.shape[1])))
+        X = R @ (depth * np.vstack([rays, np.ones_like(depth)])) + t[:, np.newaxis]
+        found = self.solve(X.T, np.full(rays.shape[1], _EXACT_SCALE)).pose
+        # Entries of R_hat - R are as large as the angle between them.
+        turned = np.abs(geometry.quaternion_to_matrix(found[3:]) - R).max()
+        return float(max(np.abs(found[:3] - t).max() / reach, turned))
 
     def _start(self, X: Array, spread: Array) -> tuple[Array, Array]:
         """Return the rotation (3, 3) and position (3,) of the start with the best likelihood."""

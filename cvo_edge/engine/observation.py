@@ -188,6 +188,10 @@ class Observer:
         spent_ms = 1e3 * (ready - start), 1e3 * (done - ready)
         return Observation(outputs, pose, point, fault, doubt, look, *spent_ms)
 
+    def solver_error(self) -> float:
+        """As ``Head.solver_error``, for the camera of the images."""
+        return self._head.solver_error(self._seen)
+
     def camera_check(self) -> CameraCheck | None:
         """Return a check of the camera for a new stream, or None if the method has none."""
         return self._head.camera_check(self._seen)

@@ -106,6 +106,13 @@ class Head(ABC):
         """
         return None
 
+    def solver_error(self, seen: SeenCamera | None) -> float:
+        """Return how wrong the solver is on this machine, for a known pose; 0 without a solver.
+
+        Arguments as for ``solver``; the unit is of the size of the place, or rad.
+        """
+        return 0.0
+
     def camera_check(self, seen: SeenCamera | None) -> CameraCheck | None:
         """Return the check of a stream's camera; None by default. Arguments as for ``solver``."""
         return None

@@ -202,6 +202,10 @@ class ScrHead(Head):
 
         return solve
 
+    def solver_error(self, seen: SeenCamera | None) -> float:
+        """As ``Head``."""
+        return self._pose_solver(_stated(seen)).error_on_exact_points()
+
     def camera_check(self, seen: SeenCamera | None) -> CameraCheck | None:
         """As ``Head``."""
         limits, signs = self.parameters.camera_limits, self.parameters.limits

@@ -1,4 +1,4 @@
-"""The self-test of a bundle: compare outputs for a known image with the expected ones."""
+"""The self-test of a bundle: outputs for a known image, and the solver's pose for exact points."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from cvo_edge.errors import GateError
 from cvo_edge.input import preprocess
 from cvo_edge.odometer import Odometer
 
+# The solver computes in float64.
+_SOLVER_TOLERANCE = 1e-9
+
 
 def observe_selftest(observer: Observer | Odometer, height: int, width: int) -> Observation:
     """Run the self-test image through preprocessing and network as frame 0."""
@@ -18,8 +21,9 @@ def observe_selftest(observer: Observer | Odometer, height: int, width: int) -> 
 def check_selftest(odometer: Odometer) -> float:
     """Compare all outputs with the expected ones; returns the largest absolute difference.
 
-    Raises GateError if it exceeds the tolerance: results on this machine differ from those at
-    calibration, so the stated probability does not hold.
+    Raises GateError if it exceeds the tolerance, or if the method's solver does not find a known
+    pose: results on this machine differ from those at calibration, so the stated probability does
+    not hold.
     """
     test = odometer.calibration.selftest
     outputs = observe_selftest(odometer, test.height, test.width).outputs
@@ -34,5 +38,11 @@ def check_selftest(odometer: Odometer) -> float:
         raise GateError(
             f"self-test: expected outputs within {test.tolerance:g}, found {worst_name} off by "
             f"{worst:.6g}; do not use the bundle on this machine, its results differ"
+        )
+    solver_error = odometer.solver_error()
+    if not solver_error <= _SOLVER_TOLERANCE:
+        raise GateError(
+            f"self-test: expected the pose of exact points within {_SOLVER_TOLERANCE:g}, found it "
+            f"off by {solver_error:.3g}; do not use the bundle on this machine, its results differ"
         )
     return worst

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from cvo_edge import Odometer, open_source
+from cvo_edge.errors import GateError
 from cvo_edge.ground_truth import open_ground_truth
+from cvo_edge.pose_solver import PoseSolver
 from cvo_edge.programs.selftest import check_selftest
 
 ARTIFACTS = Path(__file__).resolve().parents[2] / "calibration_artifacts"
@@ -27,6 +29,21 @@ def test_it_passes_its_self_test_and_is_of_its_method(demonstration):
         method, _, precision = demonstration.name.removeprefix("synthetic-room-").partition("-")
         assert odometer.calibration.method == method
         assert odometer.calibration.model.precision == (precision or "fp32")
+
+
+def test_a_machine_whose_solver_rounds_to_seven_digits_fails_the_self_test(monkeypatch):
+    solve = PoseSolver.solve
+
+    def rounded(*arguments):
+        found = solve(*arguments)
+        return found._replace(pose=found.pose.astype(np.float32).astype(np.float64))
+
+    monkeypatch.setattr(PoseSolver, "solve", rounded)
+    with (
+        Odometer.load(ARTIFACTS / "synthetic-room-scr") as odometer,
+        pytest.raises(GateError, match="self-test: expected the pose of exact points within 1e-09"),
+    ):
+        check_selftest(odometer)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -219,3 +219,10 @@ def test_a_solver_that_is_held_back_has_not_converged():
     held = PoseSolver(RAYS, identity, np.full(6, 1e-6))
     found = held.solve(points_of(truth, generator, 0.3), np.full(len(RAYS), 0.3 / CAMERA.fx))
     assert not found.last_step < 1.0
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_a_working_solver_finds_a_known_pose_in_a_place_of_any_size(size):
+    start = np.array([[3.0 * size, 2.0 * size, 0.0, 0.5, 0.5, 0.5, 0.5]])
+    damping = DEVIATION * np.repeat([size, 1.0], 3)
+    assert PoseSolver(RAYS, start, damping).error_on_exact_points() < 1e-12
