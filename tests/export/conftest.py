@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 import torch
 
+from cvo_export import publish as publishing
 from cvo_export.data.augment import AugmentConfig
 from cvo_export.datasets import synthetic
+from cvo_export.graph import to_onnx
 from cvo_export.networks.backbone import BackboneConfig
 from cvo_export.networks.heads.cjp import CjpConfig
 from cvo_export.publish import publish
@@ -44,24 +46,36 @@ def tiny_config(**changes: Any) -> TrainConfig:
     return TrainConfig(**{**values, **changes})
 
 
+# Attributes of a torch module that ``named_modules`` and ``state_dict`` already show.
+_STATE = {"_parameters", "_buffers", "_modules"}
+
+
 def ignore_progress(stage: str, done: int, total: int, note: str = "") -> None:
     """Discard progress reports."""
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _backbones_exported_once() -> Iterator[None]:
-    """Export each frozen backbone once: most runs here have the same random weights."""
-    export, graphs = features.export_onnx, {}
+def _exported_once() -> Iterator[None]:
+    """Export each network once: most runs have the same random backbone, some are published twice.
+
+    An attribute whose repr is an address makes a network differ from all others.
+    """
+    graphs: dict[str, bytes] = {}
 
     def export_once(module: Any, *rest: Any) -> bytes:
+        parts = [
+            (name, type(part), sorted((k, v) for k, v in vars(part).items() if k not in _STATE))
+            for name, part in module.named_modules()
+        ]
         state = [(name, values.numpy().tobytes()) for name, values in module.state_dict().items()]
-        key = hashlib.sha256(repr((type(module), state, rest)).encode()).hexdigest()
+        key = hashlib.sha256(repr((parts, state, rest)).encode()).hexdigest()
         if key not in graphs:
-            graphs[key] = export(module, *rest)
+            graphs[key] = to_onnx.export_onnx(module, *rest)
         return graphs[key]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(features, "export_onnx", export_once)
+        patch.setattr(publishing, "export_onnx", export_once)
         yield
 
 

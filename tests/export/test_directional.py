@@ -1,5 +1,8 @@
 """Directional quantiles: rays agree with half-spaces, and regions have the stated coverage."""
 
+import copy
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -102,13 +105,18 @@ def test_the_constant_of_least_pinball_loss_is_the_quantile(tau):
     assert best == pytest.approx(float(y.quantile(tau)), abs=0.02)
 
 
-def fitted(make, steps=400):
+def fitted(make):
     """Return a network briefly fitted to y (n, 2) given x (n, 1)."""
+    return copy.deepcopy(_fitted_once(make))
+
+
+@cache
+def _fitted_once(make):
     torch.manual_seed(0)
     generator = np.random.default_rng(0)
     network = RegionNetwork(RegionConfig(response=2, condition=1))
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
-    for _ in range(steps):
+    for _ in range(400):
         x, y = make(256, generator)
         optimiser.zero_grad()
         network.loss(torch.tensor(x).float(), torch.tensor(y).float()).backward()

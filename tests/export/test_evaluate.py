@@ -115,7 +115,7 @@ def test_the_command_line_trains_publishes_and_evaluates(tmp_path):
     run, bundle = tmp_path / "run", tmp_path / "bundle"
     trained = cvo_export(
         *("train", "cjp", DATASET, run, "--split", "sequence", "--weights", "none"),
-        *("--size", "64x48", "--copies", 1, "--steps", 100),
+        *("--backbone", "test_efficientnet", "--size", "64x48", "--copies", 1, "--steps", 100),
     )
     assert trained.returncode == 0, trained.stderr
     assert trained.stdout == ""
