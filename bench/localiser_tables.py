@@ -84,9 +84,7 @@ def _row(found: list[Report], reference: list[Report]) -> list[str]:
 
 
 def _sift_row(recording: str, split: str) -> list[str]:
-    names = [path.stem for path in result_files(FOLDER)]
-    prefix = f"sift-{recording}-{split}-"
-    found = [read_result(FOLDER, name) for name in names if name.startswith(prefix)]
+    found = _sift(recording, split)
 
     def error(name: str) -> str:
         metres = median(found, lambda r: r["point_error"][f"{name}_m"])
@@ -108,8 +106,47 @@ def _sift_row(recording: str, split: str) -> list[str]:
     ]
 
 
+def _sift(recording: str, split: str) -> list[Report]:
+    """Return the results of a map of SIFT points, one per seed."""
+    names = [path.stem for path in result_files(FOLDER)]
+    prefix = f"sift-{recording}-{split}-"
+    return [read_result(FOLDER, name) for name in names if name.startswith(prefix)]
+
+
 def _pose(metres: float, degrees: float) -> str:
     return f"{100 * metres:.2f} cm {degrees:.2f} deg"
+
+
+def predictors() -> str:
+    """Return coverage, error and width of four kinds of predictors under the pooled rule."""
+    kinds = {"scr": "scene coordinates, solver (SCR)", "cjp": "regression (CJP)", "fused": "both"}
+    rows = [
+        [name, *(_coverage(cells(grid, method)) for grid in GRIDS)]
+        for method, name in kinds.items()
+    ]
+    rows.append(["SIFT points, PnP", *(_sift_coverage(*place) for place in GRIDS.values())])
+    return table(["predictor", *GRIDS], rows)
+
+
+def _coverage(found: list[Report]) -> str:
+    return _covered(
+        median(found, lambda c: c["marginal"]["mean_coverage"]),
+        median(found, lambda c: c["point_error"]["median_m"]),
+        median(found, lambda c: c["marginal"]["mean_width"]["m"]),
+    )
+
+
+def _sift_coverage(recording: str, split: str) -> str:
+    found = _sift(recording, split)
+    return _covered(
+        median(found, lambda r: float(np.mean(r["pooled"]["coverage"]))),
+        median(found, lambda r: r["point_error"]["median_m"]),
+        median(found, lambda r: float(np.mean(r["pooled"]["mean_width"][:3]))),
+    )
+
+
+def _covered(coverage: float, error_m: float, width_m: float) -> str:
+    return f"{coverage:.3f}: {100 * error_m:.2f}, {100 * width_m:.2f} cm"
 
 
 def strangers() -> str:
@@ -223,6 +260,7 @@ def cost() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "localiser": accuracy,
+    "localiser-predictors": predictors,
     "localiser-strangers": strangers,
     "localiser-cameras": other_cameras,
     "localiser-redraws": redraws,
