@@ -25,7 +25,8 @@ from fuzz.trials import Tally, command, in_parallel
 ARTIFACTS = Path(__file__).resolve().parent.parent / "calibration_artifacts"
 # The smallest bundle of each method, quantised, and a float32 bundle for the other operators.
 BUNDLES = tuple(
-    ARTIFACTS / f"synthetic-room-{name}" for name in ("cjp-int8", "csp-int8", "mcqr-int8", "cjp")
+    ARTIFACTS / f"synthetic-room-{name}"
+    for name in ("cjp-int8", "csp-int8", "mcqr-int8", "scr-int8", "cjp")
 )
 # Accepted exit codes of a bundle with matching digests: 0 if it passes its self-test, otherwise the
 # codes for invalid files and for a failed self-test.

@@ -28,7 +28,7 @@ Image = NDArray[Any]
 
 _CLIP = ARTIFACTS / "synthetic-room-clip"
 _BUNDLES = tuple(
-    ARTIFACTS / f"synthetic-room-{method}-int8" for method in ("cjp", "cqr", "csp", "mcqr")
+    ARTIFACTS / f"synthetic-room-{method}-int8" for method in ("cjp", "cqr", "csp", "mcqr", "scr")
 )
 # Height and width of the bundles' model input.
 _MODEL_SIZE = (192, 256)
