@@ -11,6 +11,7 @@ from cvo_edge.camera import Camera
 from cvo_edge.conformal import conformal_quantile
 from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.estimate import Reason
+from cvo_edge.heads import fused as fused_module
 from cvo_edge.heads.fused import FusedHead, FusedParameters, Fusion, fused
 from cvo_edge.heads.scr import ScrHead, ScrParameters, Signs
 from cvo_edge.input.view import SeenCamera, crop_view, seen_camera
@@ -277,6 +278,16 @@ def test_two_poses_are_better_than_either():
     solved = position_error(FusedHead(FUSED, "normalised").solver(seen(CAMERA)), frames, truths)
     regressed = np.median(np.linalg.norm(val["regression"][:, :3] - truths[:, :3], axis=1))
     assert together < 0.9 * min(solved, regressed)
+
+
+def test_a_regression_that_hardly_helps_has_no_part(monkeypatch):
+    """What wins on val by a few percent may lose in the next recording."""
+    generator = np.random.default_rng(2)
+    deviation = np.array([0.02, 0.02, 0.02, 0.008, 0.008, 0.008])
+    val, truths, _ = fused_frames(generator, 200, deviation)
+    assert FusedHead(FUSED, "normalised").tuned(val, truths, val, np.arange(200)).fusion.share == 0
+    monkeypatch.setattr(fused_module, "_CLEARLY", 0.0)
+    assert FusedHead(FUSED, "normalised").tuned(val, truths, val, np.arange(200)).fusion.share > 0
 
 
 def test_a_useless_regression_does_no_harm():
