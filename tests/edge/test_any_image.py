@@ -78,8 +78,9 @@ def test_an_interval_is_finite_only_without_a_reason_against_it(odometer, scene)
         assert (estimate.pose is None) == (estimate.status is Status.INVALID)
 
     law()
-    # Degraded estimates are rare: distorted images seldom yield a plausible pose.
-    assert min(seen[Status.OK], seen[Status.INVALID]) > 50, seen
+    # Degraded estimates are rare: distorted images seldom yield a plausible pose. Hypothesis does
+    # not draw evenly: of 300, 38 to 110 are ok.
+    assert min(seen[Status.OK], seen[Status.INVALID]) > 15, seen
 
 
 @settings(max_examples=60)
