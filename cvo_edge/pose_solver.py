@@ -38,10 +38,10 @@ _LENS_STEPS, _LENS_PRECISION = 10, 1.0
 # Points closer to the image plane than this share of the damping deviation of the position, or
 # behind it, have no weight.
 _NEAR = 0.01
-# Scale of reprojection errors, normalised, for points that have none.
-_EXACT_SCALE = 0.01
 # Squared error in units of the scale of such points.
 _BEHIND = 1e6
+# Scale of reprojection errors, normalised, for exact points.
+_EXACT_SCALE = 0.01
 
 
 class Solution(NamedTuple):

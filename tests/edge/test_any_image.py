@@ -58,7 +58,8 @@ def one_of_a_scene(data, scene):
 def test_an_interval_is_finite_only_without_a_reason_against_it(odometer, scene):
     seen = Counter()
 
-    @settings(max_examples=300)
+    # Hypothesis does not draw evenly: of 300, sometimes only 38 were ok.
+    @settings(max_examples=600)
     @given(data=st.data(), stamp_ns=stamps)
     def law(data, stamp_ns):
         kind = data.draw(st.sampled_from(["none", "anything", "image", "scene", "scene"]))
@@ -78,9 +79,8 @@ def test_an_interval_is_finite_only_without_a_reason_against_it(odometer, scene)
         assert (estimate.pose is None) == (estimate.status is Status.INVALID)
 
     law()
-    # Degraded estimates are rare: distorted images seldom yield a plausible pose. Hypothesis does
-    # not draw evenly: of 300, 38 to 110 are ok.
-    assert min(seen[Status.OK], seen[Status.INVALID]) > 15, seen
+    # Degraded estimates are rare: distorted images seldom yield a plausible pose.
+    assert min(seen[Status.OK], seen[Status.INVALID]) > 50, seen
 
 
 @settings(max_examples=60)

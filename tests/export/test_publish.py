@@ -81,7 +81,7 @@ def test_torch_and_the_graph_agree_and_another_graph_does_not(tiny_bundle, tiny_
 class _Scaled(nn.Module):
     """x -> (scale x,): a graph with one output."""
 
-    def __init__(self, scale: float) -> None:
+    def __init__(self, scale: float | list[float]) -> None:
         super().__init__()
         self.register_buffer("scale", torch.tensor(scale))
 
@@ -90,7 +90,7 @@ class _Scaled(nn.Module):
 
 
 @pytest.mark.parametrize("size", [1.0, 1000.0])
-def test_parity_is_relative_to_the_size_of_an_output_above_one(size):
+def test_parity_is_relative_to_numbers_above_one(size):
     session = Session(export_onnx(_Scaled(size), [torch.ones((1, 1))], ["x"], ["y"]))
     feed = {"x": np.ones((1, 1), np.float32)}
 
@@ -101,6 +101,15 @@ def test_parity_is_relative_to_the_size_of_an_output_above_one(size):
     for wrong in (2e-4, np.nan, np.inf):
         with pytest.raises(GateError, match="agree"):
             difference(wrong)
+
+
+def test_a_large_number_excuses_no_error_of_a_small_one_beside_it():
+    """A pose holds metres and a quaternion: 500 m away, the rotation must still agree."""
+    feed = {"x": np.array([[500.0, 1.0]], np.float32)}
+    session = Session(export_onnx(_Scaled([1.0, 1.0]), [torch.ones((1, 2))], ["x"], ["y"]))
+    assert check_parity(_Scaled([1.0 + 5e-5, 1.0]), session, [feed], ["x"]) < 1e-4
+    with pytest.raises(GateError, match="agree"):
+        check_parity(_Scaled([1.0, 1.0 + 2e-4]), session, [feed], ["x"])
 
 
 def test_a_bundle_is_replaced_whole_and_anything_else_is_refused(tiny_run, tiny_bundle, tmp_path):
