@@ -102,7 +102,7 @@ def _export(run: Run, precision: Precision) -> tuple[bytes, float]:
     content = export_onnx(graph, inputs, names, head.output_names)
     feeds = _feeds(run, run.split.roles["val"][:_PARITY_FRAMES])
     session = Session(content)
-    parity = check_parity(run.graph, session, feeds, names)
+    parity = check_parity(run.graph, session, feeds, names, head.point_outputs)
     if precision == "int8":
         training = np.concatenate([run.split.roles["train"], run.split.roles["fit"]])
         spread = np.linspace(0, training.size - 1, min(_RANGE_FRAMES, training.size)).astype(int)

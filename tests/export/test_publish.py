@@ -112,6 +112,19 @@ def test_a_large_number_excuses_no_error_of_a_small_one_beside_it():
         check_parity(_Scaled([1.0, 1.0 + 2e-4]), session, [feed], ["x"])
 
 
+def test_a_number_of_a_far_point_is_compared_with_the_distance_of_the_point():
+    feed = {"x": np.array([[40.0, 1.0, 3.0]], np.float32)}
+    session = Session(export_onnx(_Scaled([1.0] * 3), [torch.ones((1, 3))], ["x"], ["y"]))
+
+    def difference(part: float) -> float:
+        return check_parity(_Scaled([1.0, 1.0 + part, 1.0]), session, [feed], ["x"], ["y"])
+
+    assert difference(2e-3) == pytest.approx(2e-3 / np.sqrt(1610.0), rel=0.01)
+    for wrong in (5e-3, np.nan, np.inf):
+        with pytest.raises(GateError, match="agree"):
+            difference(wrong)
+
+
 def test_a_bundle_is_replaced_whole_and_anything_else_is_refused(tiny_run, tiny_bundle, tmp_path):
     target = tmp_path / "bundle"
     publish(tiny_run, target, "first")

@@ -6,7 +6,7 @@ import contextlib
 import io
 import logging
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 import torch
@@ -73,11 +73,13 @@ def check_parity(
     session: Session,
     feeds: Iterable[dict[str, NDArray[np.generic]]],
     input_names: Sequence[str],
+    points: Collection[str] = (),
 ) -> float:
     """Return the largest difference of any output between torch and the exported graph.
 
-    It is relative to each number that exceeds 1, and absolute for the others. Raises GateError if
-    it exceeds ``PARITY_TOLERANCE`` or is NaN.
+    It is relative to each number that exceeds 1, and absolute for the others; in the outputs
+    ``points`` (..., 3), it is relative to the point's distance from the origin instead. Raises
+    GateError if it exceeds ``PARITY_TOLERANCE`` or is NaN.
     """
     names = [spec.name for spec in session.outputs]
     worst = 0.0
@@ -88,9 +90,12 @@ def check_parity(
             expected = module(*(torch.from_numpy(feed[name]) for name in input_names))
         for name, tensor in zip(names, expected, strict=True):
             values = tensor.numpy()
+            size = np.abs(values)
+            if name in points:
+                size = np.linalg.norm(values, axis=-1, keepdims=True)
             # Infinite numbers give NaN, which is refused.
             with np.errstate(invalid="ignore"):
-                ratio = np.abs(values - found[name]) / np.maximum(1.0, np.abs(values))
+                ratio = np.abs(values - found[name]) / np.maximum(1.0, size)
             difference = float(ratio.max())
             worst = max(worst, difference) if difference == difference else np.inf
     if not worst <= PARITY_TOLERANCE:

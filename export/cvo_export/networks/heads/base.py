@@ -130,12 +130,15 @@ class ExportedHead(nn.Module):
         The chart of the six numbers.
     extra_inputs
         Name -> example value of each additional argument of ``forward``.
+    point_outputs
+        Names of outputs that are points, (..., 3): one number of a far point may be near zero.
     """
 
     output_names: tuple[str, ...]
     runtime_method: str
     rotation: Rotation = "tangent_reference"
     extra_inputs: Mapping[str, Tensor] = {}
+    point_outputs: tuple[str, ...] = ()
 
     @abstractmethod
     def candidates(self) -> tuple[Candidate, ...]:

@@ -69,6 +69,7 @@ class FusedHead(ExportedHead):
     """Map of the stem -> the outputs of SCR, regression (n, 7) and half_width (n, 6)."""
 
     output_names = ("coordinates", "log_scale_px", "regression", "half_width")
+    point_outputs = ScrHead.point_outputs
     runtime_method = "fused"
     rotation = "tangent_predicted"
 

@@ -297,6 +297,7 @@ class ScrHead(ExportedHead):
     """Map of the stem -> coordinates (n, cells, 3), m, and log_scale_px (n, cells)."""
 
     output_names = ("coordinates", "log_scale_px")
+    point_outputs = ("coordinates",)
     runtime_method = "scr"
     rotation = "tangent_predicted"
 
