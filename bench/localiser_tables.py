@@ -88,6 +88,8 @@ def _sift_row(recording: str, split: str) -> list[str]:
 
     def error(name: str) -> str:
         metres = median(found, lambda r: r["point_error"][f"{name}_m"])
+        if f"{name}_deg" not in found[0]["point_error"]:
+            return f"{100 * metres:.2f} cm"
         return _pose(metres, median(found, lambda r: r["point_error"][f"{name}_deg"]))
 
     pooled = [report["pooled"] for report in found]
