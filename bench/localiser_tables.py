@@ -160,12 +160,13 @@ def strangers() -> str:
     }
     groups: dict[str, dict[str, dict[str, Report]]] = defaultdict(lambda: defaultdict(dict))
     for name, report in found.items():
-        for group in ("altered", "not_stated", "places"):
+        for group in ("altered", "not_stated", "misstated", "places"):
             for kind, figures in report[group].items():
                 groups[group][kind][name] = figures
     titles = {
         "altered": "image",
         "not_stated": "another camera, not stated",
+        "misstated": "the same camera, misstated",
         "places": "another place",
     }
     rows = []

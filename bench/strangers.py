@@ -2,10 +2,10 @@
 
     python bench/strangers.py BUNDLE DATASET [--place DATASET ...] [--json FILE]
 
-Test frames of DATASET pass as they are, altered, through other cameras that nobody states, and
-through other cameras that are stated; then come frames of other places, with their own cameras
-stated. Each recording is one stream. An interval is wrong if its joint set at 0.9 misses the true
-pose; every interval of another place is, unless both have the same world.
+Test frames of DATASET pass as they are, altered, through other cameras that nobody states, through
+other cameras that are stated, and with wrong numbers stated; then come frames of other places, with
+their own cameras stated. Each recording is one stream. An interval is wrong if its joint set at 0.9
+misses the true pose; every interval of another place is, unless both have the same world.
 """
 
 from __future__ import annotations
@@ -185,6 +185,17 @@ STATED = {
 }
 
 
+def misstated(own: Camera) -> dict[str, Camera]:
+    """Return cameras that somebody states by mistake for images of ``own``."""
+    return {
+        "focal length x 1.01": replace(own, fx=1.01 * own.fx, fy=1.01 * own.fy),
+        "focal length x 1.025": replace(own, fx=1.025 * own.fx, fy=1.025 * own.fy),
+        "focal length x 1.05": replace(own, fx=1.05 * own.fx, fy=1.05 * own.fy),
+        "principal point 1 % of the width aside": replace(own, cx=own.cx + 0.01 * own.width),
+        "principal point 3 % of the width aside": replace(own, cx=own.cx + 0.03 * own.width),
+    }
+
+
 def line(name: str, found: dict[str, Any]) -> str:
     """Return one row of the printed table."""
     text = f"  {name:<30} {found['frames']:>4} frames, finite {found['finite']:.3f}, wrong "
@@ -241,6 +252,9 @@ def main() -> None:
         if figures["finite"]:
             accuracy["joint_coverage"] = 1.0 - figures["wrong"] / figures["finite"]
         add("stated", name, {**figures, **accuracy})
+    print("the bundle's camera, other numbers stated")
+    for name, camera in misstated(own).items():
+        add("misstated", name, run(bundle, dataset, test, lambda image: image, camera).figures())
     print("other places, their cameras stated")
     for text in arguments.place:
         place = open_dataset(text)

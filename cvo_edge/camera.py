@@ -39,6 +39,8 @@ _CONVERGED = 1e-9
 _ALONG = 33
 # Smallest side of an image, largest camera file.
 LEAST_SIDE, _LARGEST_FILE = 16, 64 * 1024
+# Wider pinhole images exist in files with a mistake only.
+_WIDEST_DEG = 170.0
 
 
 class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
@@ -165,7 +167,7 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit
 
 def read_camera(path: Path) -> Camera:
     """Read a camera from a JSON file with the fields of ``Camera``; raises UsageError."""
-    content = read_regular_file(path, _LARGEST_FILE, UsageError)
+    content = read_regular_file(path, _LARGEST_FILE, UsageError, links=True)
     try:
         return msgspec.json.decode(content, type=Camera)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -178,7 +180,9 @@ def checked_camera(camera: object) -> Camera:
     if not isinstance(camera, Camera):
         raise UsageError(f"camera: expected a Camera, found {type(camera).__name__}")
     try:
-        checked = msgspec.convert(msgspec.to_builtins(camera), Camera)
+        given = {name: getattr(camera, name) for name in camera.__struct_fields__}
+        plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in given.items()}
+        checked = msgspec.convert(msgspec.to_builtins(plain), Camera)
     except (msgspec.ValidationError, TypeError, ValueError, KeyError) as error:
         raise UsageError(f"camera: expected the intrinsics of a camera, found: {error}") from None
     if min(checked.width, checked.height) < LEAST_SIDE:
@@ -191,6 +195,17 @@ def checked_camera(camera: object) -> Camera:
         if not -length <= value <= 2 * length:
             raise UsageError(
                 f"camera: expected {name} from {-length} to {2 * length} pixels, found {value:g}"
+            )
+    if checked.distortion != "equidistant":
+        views = [
+            2.0 * math.degrees(math.atan(0.5 * length / focal))
+            for length, focal in ((checked.width, checked.fx), (checked.height, checked.fy))
+        ]
+        if max(views) > _WIDEST_DEG:
+            raise UsageError(
+                f"camera: expected a field of view of at most {_WIDEST_DEG:g} degrees without the "
+                f"distortion of a fisheye, found {max(views):.1f} by {checked.width}x"
+                f"{checked.height} pixels with fx {checked.fx:g} and fy {checked.fy:g}"
             )
     return checked
 

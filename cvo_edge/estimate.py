@@ -184,7 +184,7 @@ class PoseInterval:
     def contains(self, pose: Pose | ArrayLike) -> bool:
         """Whether the set holds this pose in all six degrees of freedom at once.
 
-        In the joint scope of MCQR the test uses the region, which is smaller than its hull;
+        In the joint scope of a method with a region, the test uses it instead of its hull;
         otherwise all six values of ``covers`` must be true. Raises as ``covers``.
         """
         return self.conformal_set.contains(self._coordinates(pose))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import stat
@@ -30,15 +31,17 @@ def regular_file(
     except FileNotFoundError:
         raise error(f"{path}: no such file") from None
     except OSError as failure:
+        if failure.errno == errno.ELOOP:
+            raise error(f"{path}: expected a regular file, found a symbolic link") from None
         raise error(f"{path}: cannot be opened as a regular file: {failure.strerror}") from None
-    stream = os.fdopen(descriptor, "rb")
     found = os.fstat(descriptor)
     if stat.S_ISREG(found.st_mode) and found.st_size <= limit:
-        return stream
-    stream.close()
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
     if stat.S_ISREG(found.st_mode):
         raise error(f"{path}: expected at most {limit} bytes, found {found.st_size}")
-    raise error(f"{path}: not a regular file")
+    kind = "a folder" if stat.S_ISDIR(found.st_mode) else "another kind of file"
+    raise error(f"{path}: expected a regular file, found {kind}")
 
 
 def read_regular_file(

@@ -40,6 +40,8 @@ _LENS_STEPS, _LENS_PRECISION = 10, 1.0
 _NEAR = 0.01
 # Squared error in units of the scale of such points.
 _BEHIND = 1e6
+# Squared error, normalised, of such points where a start is chosen.
+_BEHIND_SQUARED = 1e6
 # Scale of reprojection errors, normalised, for exact points.
 _EXACT_SCALE = 0.01
 
@@ -132,7 +134,7 @@ class PoseSolver:
         ahead = Y[:, 2] > self._near
         depth = np.where(ahead, Y[:, 2], 1.0)
         error = Y[:, :2] / depth[:, np.newaxis] - self._rays
-        squared = np.where(ahead, np.square(error).sum(axis=1), 1e6)
+        squared = np.where(ahead, np.square(error).sum(axis=1), _BEHIND_SQUARED)
         best = int(np.log1p(squared / spread).sum(axis=1).argmin())
         return self._R[best], self._t[best]
 

@@ -94,7 +94,7 @@ class FusedHead(ScrHead):
             return found.pose, fusion.kappa * found.information, added
         regression = np.asarray(outputs["regression"][0], np.float64)
         regression[3:] = geometry.quaternion_normalise(regression[3:])
-        pose, information, disagreement = fused(
+        pose, information, disagreement = fuse(
             found.pose, found.information, regression, outputs["half_width"][0], fusion
         )
         return pose, information, {**added, "disagreement": np.array([[disagreement]])}
@@ -151,7 +151,7 @@ class FusedHead(ScrHead):
         return (Candidate(self.score, parameters),)
 
 
-def fused(
+def fuse(
     solved: Array,
     information: Array,
     regression: Array,
@@ -189,7 +189,7 @@ def _disagreement_limit(known: Mapping[str, NDArray[Any]], fusion: Fusion) -> fl
     frames = (known["solved_pose"], known["solved"], known["half_width"])
     solved, information, half_width = (values[located] for values in frames)
     found = [
-        fused(*frame, fusion)[2]
+        fuse(*frame, fusion)[2]
         for frame in zip(solved, information, regression, half_width, strict=True)
     ]
     return _DISAGREEMENT_MARGIN * max(found)
@@ -210,7 +210,7 @@ def _score(
 ) -> float:
     """Return the interval score at 0.9 over n val frames, in units of their median error."""
     found = [
-        fused(*frame, fusion)
+        fuse(*frame, fusion)
         for frame in zip(solved, information, regression, half_width, strict=True)
     ]
     error = np.abs([_offset(pose, each[0]) for pose, each in zip(poses, found, strict=True)])

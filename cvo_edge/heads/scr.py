@@ -127,11 +127,11 @@ class ScrHead(Head):
             )
         self._check_solver()
         for entry in thresholds:
-            refuse_negative(entry, "scr")
+            refuse_negative(entry, self.method)
             if entry.scope == "joint" and entry.q_hat != (entry.q_hat[0],) * 6:
                 raise CalibrationFileError(
-                    "thresholds.q_hat: expected the same distance six times for scr and scope "
-                    f"joint, found {list(entry.q_hat)} at {entry.confidence}"
+                    f"thresholds.q_hat: expected the same distance six times for {self.method} and "
+                    f"scope joint, found {list(entry.q_hat)} at {entry.confidence}"
                 )
 
     def _check_solver(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
@@ -20,15 +21,19 @@ from cvo_edge.programs.measure import LatencyProfile, memory_mib
 
 Array = NDArray[np.float64]
 
+# Logarithm of a focal length that differs so much from the stated one that a reader should know.
+_WORTH_A_LOOK = 0.02
+
 
 @dataclass
 class RunSummary:
     """Counts, latencies and, with ground truth, coverage, in constant memory.
 
     ``width_sum`` sums the widths of bounded frames, without gaps; ``disjoint`` counts frames with a
-    gap in some degree of freedom; ``skipped`` counts frames dropped for a newer one; ``compared``
-    counts frames with an estimated and a true pose, and ``covered`` those whose set holds the true
-    value, per degree of freedom; ``camera`` is what the frames show of the camera, if they do.
+    gap in some degree of freedom; ``skipped`` counts frames dropped for a newer one; ``matched``
+    counts frames that have a true pose, ``compared`` those of status ok among them, and ``covered``
+    those whose set holds the true value, per degree of freedom; ``camera`` is what the frames show
+    of the camera, if they do.
     """
 
     dof: tuple[str, ...]
@@ -42,6 +47,7 @@ class RunSummary:
     disjoint: int = 0
     skipped: int = 0
     width_sum: Array = field(default_factory=lambda: np.zeros(6))
+    matched: int = 0
     compared: int = 0
     covered: Array = field(default_factory=lambda: np.zeros(6))
     covered_jointly: int = 0
@@ -60,7 +66,9 @@ class RunSummary:
             self.bounded += 1
             self.width_sum += estimate.conformal_set.width()
             self.disjoint += any(len(row) > 1 for row in estimate.bands or ())
-        if truth is not None and estimate.pose is not None:
+        # A frame that a check flags has no interval that could hold anything.
+        self.matched += truth is not None
+        if truth is not None and estimate.status is Status.OK:
             self.compared += 1
             self.covered += estimate.covers(truth)
             self.covered_jointly += estimate.contains(truth)
@@ -83,9 +91,10 @@ class RunSummary:
             lines.append(f"remarks     {found}")
         if self.camera is not None:
             fx, fy, k1, frames = self.camera
+            wrong = max(abs(math.log(fx)), abs(math.log(fy))) > _WORTH_A_LOOK
             lines.append(
                 f"camera      by {frames} frames: fx {fx:.3f} x and fy {fy:.3f} x the stated, "
-                f"k1 {k1:+.3f}"
+                f"k1 {k1:+.3f}" + ("; check the stated intrinsics" if wrong else "")
             )
         latency = self.latency.summary()
         if latency:
@@ -104,7 +113,10 @@ class RunSummary:
             cells = "".join(f"{f'{v:.1f} {u}':>9}" for v, u in zip(shown, units, strict=True))
             lines.append("mean width".ljust(len(lines[-1]) - 54) + cells)
         if self.with_truth and not self.compared:
-            lines.append("coverage    no frame matched the ground truth, by name or by stamp")
+            nothing = "no frame matched the ground truth, by name or by stamp"
+            if self.matched:
+                nothing = f"none of the {self.matched} frames with a true pose has status ok"
+            lines.append(f"coverage    {nothing}")
         if self.compared:
             share = self.covered / self.compared
             lines.append(

@@ -265,6 +265,35 @@ def test_ground_truth_that_matches_nothing_is_said(bundle_dir, clip_dir, tmp_pat
     assert "no frame matched the ground truth" in result.stderr
 
 
+def test_a_folder_in_place_of_a_file_of_a_bundle_is_refused(copied_bundle):
+    for name, code in (("model.onnx", 4), ("calibration.json", 3)):
+        path = copied_bundle / name
+        content = path.read_bytes()
+        path.unlink()
+        path.mkdir()
+        for command in (("verify", copied_bundle), ("inspect", copied_bundle)):
+            if (name, command[0]) != ("model.onnx", "inspect"):
+                refused(cvo_edge(*command), code)
+        path.rmdir()
+        path.write_bytes(content)
+
+
+def test_a_frame_without_an_interval_covers_nothing(bundle_dir, clip_dir, tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for number, path in enumerate(sorted(clip_dir.glob("*.color.jpg"))[:4]):
+        image = cv2.imread(str(path))
+        # Every second image is black.
+        cv2.imwrite(str(frames / path.name), image * (number % 2))
+    shown = cvo_edge("run", bundle_dir, frames, "--ground-truth", clip_dir)
+    counted = [line for line in shown.stderr.splitlines() if line.startswith("coverage")]
+    assert counted[0].endswith("of 2 frames")
+    for path in frames.iterdir():
+        cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path))))
+    black = cvo_edge("run", bundle_dir, frames, "--ground-truth", clip_dir)
+    assert "coverage    none of the 4 frames with a true pose has status ok" in black.stderr
+
+
 def test_bench_of_a_source_without_frames_ends(bundle_dir, tmp_path):
     path = tmp_path / "empty.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (64, 48))

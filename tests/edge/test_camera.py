@@ -88,11 +88,30 @@ def test_lenses_that_no_camera_has_give_no_rays():
         (msgspec.structs.replace(PINHOLE, fx=float("nan")), "expected the intrinsics"),
         (msgspec.structs.replace(PINHOLE, width=1, height=1), "at least 16 pixels .* found 1x1"),
         (msgspec.structs.replace(PINHOLE, cx=9e5), "expected cx from -640 to 1280 pixels"),
+        (
+            msgspec.structs.replace(PINHOLE, width=100_000, height=100_000),
+            "field of view of at most 170 degrees .* found 178.7",
+        ),
     ],
 )
 def test_what_cannot_be_a_camera_is_refused(camera, problem):
     with pytest.raises(UsageError, match=f"camera: .*{problem}"):
         checked_camera(camera)
+
+
+def test_numbers_of_numpy_are_numbers():
+    values = {name: getattr(PINHOLE, name) for name in PINHOLE.__struct_fields__}
+    values["width"], values["fx"] = np.int64(values["width"]), np.float32(values["fx"])
+    assert checked_camera(Camera(**values)) == PINHOLE
+
+
+def test_a_camera_file_may_be_a_link_and_no_folder(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_bytes(msgspec.json.encode(RADIAL))
+    (tmp_path / "link.json").symlink_to(path)
+    assert read_camera(tmp_path / "link.json") == RADIAL
+    with pytest.raises(UsageError, match="expected a regular file, found a folder"):
+        read_camera(tmp_path)
 
 
 def test_a_camera_file_that_is_no_text_or_never_ends_is_refused(tmp_path):

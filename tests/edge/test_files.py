@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cvo_edge.errors import SinkError
-from cvo_edge.files import whole_file, write_text, write_whole
+from cvo_edge.files import read_regular_file, whole_file, write_text, write_whole
 
 
 @pytest.mark.parametrize("durable", [False, True])
@@ -53,6 +53,24 @@ def test_other_errors_pass_and_leave_nothing(tmp_path, error):
     with pytest.raises(error):
         fails(tmp_path / "a")
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_regular_file_is_refused_by_its_kind(tmp_path):
+    content = tmp_path / "content"
+    content.write_bytes(b"content")
+    link = tmp_path / "link"
+    link.symlink_to(content)
+    os.mkfifo(tmp_path / "pipe")
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for path, kind in (
+        (tmp_path, "a folder"),
+        (link, "a symbolic link"),
+        (tmp_path / "pipe", "another kind of file"),
+    ):
+        with pytest.raises(SinkError, match=f"expected a regular file, found {kind}$"):
+            read_regular_file(path, 100, SinkError)
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    assert read_regular_file(link, 100, SinkError, links=True) == b"content"
 
 
 def test_a_folder_is_made_only_on_request(tmp_path):

@@ -109,7 +109,7 @@ def test_no_ground_truth_is_refused(tmp_path):
     os.mkfifo(tmp_path / "fifo")
     with pytest.raises(SourceError, match="expected a TUM trajectory"):
         open_ground_truth(tmp_path / "none.txt")
-    with pytest.raises(SourceError, match="not a regular file"):
+    with pytest.raises(SourceError, match="expected a regular file, found another kind of file"):
         open_ground_truth(tmp_path / "fifo")
 
 

@@ -12,7 +12,7 @@ from cvo_edge.conformal import conformal_quantile
 from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.estimate import Reason
 from cvo_edge.heads import fused as fused_module
-from cvo_edge.heads.fused import FusedHead, FusedParameters, Fusion, fused
+from cvo_edge.heads.fused import FusedHead, FusedParameters, Fusion, fuse
 from cvo_edge.heads.scr import ScrHead, ScrParameters, Signs
 from cvo_edge.input.view import SeenCamera, crop_view, seen_camera
 from cvo_edge.pose import Chart
@@ -339,7 +339,7 @@ def test_the_fused_pose_minimises_the_sum_of_both_losses():
         return fusion.kappa * e @ information @ e + fusion.share * apart @ apart
 
     oracle = minimize(loss, np.zeros(6), method="BFGS", options={"gtol": 1e-9})
-    pose, found, disagreement = fused(solved, information, regression, half_width, fusion)
+    pose, found, disagreement = fuse(solved, information, regression, half_width, fusion)
     np.testing.assert_allclose(error(pose, solved), oracle.x, atol=1e-5)
     assert disagreement == pytest.approx(oracle.fun / 6.0, rel=1e-3)
     weight = fusion.share / np.square(np.array(fusion.rho) * half_width)
@@ -369,7 +369,7 @@ def test_disagreement_widens_the_covariance():
     for offset in (0.0, 0.1, 1.0):
         regression = solved.copy()
         regression[0] = offset
-        pose, information, disagreement = fused(
+        pose, information, disagreement = fuse(
             solved, 1e4 * np.eye(6), regression, np.full(6, 0.01), fusion
         )
         assert pose[0] == pytest.approx(offset / 2)
