@@ -178,7 +178,7 @@ def cropped(own: Camera, share: float, scale: float) -> tuple[Camera, Change]:
 # Share of the sides, and scale of what is left; the first changes nothing.
 STATED = {
     "as it is": (1.0, 1.0),
-    "half the pixels of each side": (1.0, 0.5),
+    "half the resolution": (1.0, 0.5),
     "cut to 0.9": (0.9, 1.0),
     "cut to 0.8, scaled by 1.25": (0.8, 1.25),
     "cut to 0.7, scaled by 0.75": (0.7, 0.75),
