@@ -43,9 +43,9 @@ _FOCAL_MARGIN, _DISTORTION_MARGIN = 3.5, 6.0
 # Limits in deviations over the largest of all pairs, which differ less between recordings; but not
 # more over what the median recording shows at most.
 _DEVIATION_MARGIN, _DEVIATION_MOST = 2.0, 4.0
-# Limits of a camera that the network has not learned are wider by a factor: its cells err more, and
-# a narrower image tells focal length from distance less well.
-_OTHER = 2.0
+# Limits of a camera that shows the network clearly less than it has learned are wider by a factor:
+# its cells err more, and a narrower image tells focal length from distance less well.
+_NARROW = 2.0
 # Share of the usual motion between two frames of a recording that makes a frame new evidence.
 _STEP_SHARE, _LEAST_STEP = 0.5, 1e-6
 # The least distinct directions keep an estimate of what the frames leave open near zero.
@@ -90,8 +90,9 @@ class CameraCheck:
     error_px
         Median reprojection error of the known place: a camera is only reported if it explains the
         frames that well.
-    learned
-        Whether the network has learned the stated camera.
+    narrow
+        Whether the stated camera's images fill clearly less of the model's input than those that
+        the network has learned.
     """
 
     def __init__(
@@ -101,10 +102,10 @@ class CameraCheck:
         limits: LensLimits,
         error_px: float,
         *,
-        learned: bool = True,
+        narrow: bool = False,
     ) -> None:
         self._solver, self._focal_px, self._error_px = solver, focal_px, error_px
-        factor = 1.0 if learned else _OTHER
+        factor = _NARROW if narrow else 1.0
         self._limits = factor * np.array([limits.log_focal, limits.log_focal, limits.distortion])
         self._deviations = factor * np.array(limits.deviations)
         self._step = np.array(limits.step)

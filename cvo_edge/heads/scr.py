@@ -52,6 +52,8 @@ _CONVERGED_STEPS = 20
 BEST_CELLS = 100
 # Fewer cells would leave too little to tell a known place from another.
 _LEAST_SEEN = 0.25
+# Share of the input that another camera's images fill at least to be checked as the learned one is.
+_NEARLY_ALL = 0.9
 # A cell contradicts the pose if its reprojection error exceeds this many scales.
 _CONTRADICTS = 3.0
 _HAIR = 1e-12
@@ -213,7 +215,8 @@ class ScrHead(Head):
             return None
         seen = _stated(seen)
         solver, focal_px = self._pose_solver(seen), seen.camera.focal_px
-        return CameraCheck(solver, focal_px, limits, signs.error_px, learned=seen.learned)
+        narrow = seen.filled < _NEARLY_ALL
+        return CameraCheck(solver, focal_px, limits, signs.error_px, narrow=narrow)
 
     def _pose_solver(self, seen: SeenCamera) -> PoseSolver:
         rows, columns = self.parameters.grid

@@ -72,6 +72,12 @@ class SeenCamera(NamedTuple):
     place: Box
     learned: bool
 
+    @property
+    def filled(self) -> float:
+        """Share of the input that shows images."""
+        height, width = self.place.shape
+        return height * width / (self.camera.height * self.camera.width)
+
     def rays(self, grid: tuple[int, int]) -> Array:
         """Return rays (rows * columns, 2) of cell centres, NaN for cells with other pixels."""
         height, width = self.camera.height, self.camera.width

@@ -110,24 +110,24 @@ def test_a_window_of_frames_shows_five_percent(lens):
     assert set(found[WINDOW - 1 :]) == {any(lens)}
 
 
-@pytest.mark.parametrize(("learned", "differs"), [(True, True), (False, False)])
-def test_a_camera_that_was_stated_has_wider_limits(learned, differs):
+@pytest.mark.parametrize(("narrow", "differs"), [(False, True), (True, False)])
+def test_a_camera_that_shows_less_has_wider_limits(narrow, differs):
     generator = np.random.default_rng(14)
     frames = [outputs_of(*seen_by(np.array([0.03, 0.03, 0.0]), generator)) for _ in range(WINDOW)]
     evidence = [(each["lens_gradient"][0], each["lens_information"][0]) for each in frames]
     largest = float(np.abs(summed(evidence)).max())
-    stream = check(LensLimits(largest / 1.5, largest / 1.5, NEVER, STEP), learned=learned)
+    stream = check(LensLimits(largest / 1.5, largest / 1.5, NEVER, STEP), narrow=narrow)
     assert [stream.differs(each, familiar=True) for each in frames][-1] == differs
 
 
 @pytest.mark.parametrize(
-    ("drift", "learned", "differs"),
-    [(0.0, True, False), (0.1, True, True), (0.1, False, True), (0.01, False, False)],
+    ("drift", "narrow", "differs"),
+    [(0.0, False, False), (0.1, False, True), (0.1, True, True), (0.01, True, False)],
 )
-def test_two_frames_show_a_lens_that_is_off_by_many_deviations(drift, learned, differs):
+def test_two_frames_show_a_lens_that_is_off_by_many_deviations(drift, narrow, differs):
     generator = np.random.default_rng(9)
     limits = msgspec.structs.replace(LIMITS, deviations=(3.0, 3.0, 3.0))
-    stream = check(limits, learned=learned)
+    stream = check(limits, narrow=narrow)
     lens = np.array([drift, drift, 0.0])
     frames = [outputs_of(*seen_by(lens, generator, noise=5e-4)) for _ in range(WINDOW - 1)]
     found = [stream.differs(frame, familiar=True) for frame in frames]

@@ -106,3 +106,11 @@ def test_whether_the_network_has_learned_the_camera(crop):
     shifted = msgspec.structs.replace(CAMERA, cx=350.0)
     for camera in (CAMERA.zoomed(1.02), shifted, RADIAL, CAMERA.cropped(0, 400, 0, 640)):
         assert not seen_camera(camera, own, crop).learned
+
+
+def test_a_narrower_camera_fills_less_of_the_input():
+    learned = Camera(width=256, height=192, fx=200.0, fy=200.0, cx=127.5, cy=95.5)
+    whole = seen_camera(learned, learned, "none")
+    narrow = seen_camera(learned.cropped(19, 173, 26, 230), learned, "none")
+    assert whole.filled == 1.0
+    assert narrow.filled == pytest.approx(154 * 204 / (192 * 256))
