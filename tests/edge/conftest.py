@@ -1,8 +1,9 @@
-"""A simulated clock for tests."""
+"""A simulated clock, and an oracle that a board may lack."""
 
 from __future__ import annotations
 
 from threading import Event
+from typing import Any
 
 import pytest
 
@@ -38,3 +39,9 @@ class SimulatedClock(Clock):
 @pytest.fixture
 def clock() -> SimulatedClock:
     return SimulatedClock()
+
+
+@pytest.fixture
+def optimize() -> Any:
+    """``scipy.optimize``; skips the test on a board without scipy."""
+    return pytest.importorskip("scipy.optimize")

@@ -3,7 +3,6 @@
 import msgspec
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 
 from cvo_edge import geometry
 from cvo_edge.camera_check import (
@@ -68,7 +67,7 @@ def check(limits=LIMITS, **options):
     return CameraCheck(solver(), FOCAL_PX, limits, error_px=1.0, **options)
 
 
-def test_evidence_is_the_derivative_of_the_profiled_likelihood():
+def test_evidence_is_the_derivative_of_the_profiled_likelihood(optimize):
     # Oracle: scipy fits the pose again for a slightly different camera.
     points, scale, pose = seen_by(np.zeros(3), np.random.default_rng(0))
     evidence = solver().lens_evidence(points, scale, pose)
@@ -82,7 +81,9 @@ def test_evidence_is_the_derivative_of_the_profiled_likelihood():
         return 0.5 * (NU + 2.0) * np.log1p(squared / (NU * np.square(scale))).sum()
 
     def profiled(lens):
-        found = minimize(loss, np.zeros(6), args=(lens,), method="BFGS", options={"gtol": 1e-3})
+        found = optimize.minimize(
+            loss, np.zeros(6), args=(lens,), method="BFGS", options={"gtol": 1e-3}
+        )
         return -found.fun
 
     h = 0.1 / np.sqrt(np.diag(evidence.information))

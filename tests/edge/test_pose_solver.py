@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize, minimize_scalar
 
 from cvo_edge import geometry
 from cvo_edge.camera import Camera, cell_centres
@@ -56,7 +55,7 @@ def test_a_third_of_wrong_points_does_not_matter(seed):
     assert np.linalg.norm(error(truth, found.pose)[:3]) < 0.01
 
 
-def test_the_pose_maximises_the_likelihood():
+def test_the_pose_maximises_the_likelihood(optimize):
     """A general optimiser, started at the solution, finds nothing better."""
     generator = np.random.default_rng(3)
     truth = pose_near(generator)
@@ -71,7 +70,7 @@ def test_the_pose_maximises_the_likelihood():
         squared = np.square((Y[:, :2] / Y[:, 2:] - RAYS) / scale[:, None]).sum(axis=1)
         return (NU + 2.0) / 2.0 * np.log1p(squared / NU).sum()
 
-    best = minimize(loss, np.zeros(6), method="BFGS", options={"gtol": 1e-9})
+    best = optimize.minimize(loss, np.zeros(6), method="BFGS", options={"gtol": 1e-9})
     assert np.abs(best.x).max() < 1e-5
     assert found.last_step < 1e-4
 
@@ -147,7 +146,7 @@ def test_one_quaternion_is_that_of_the_vectorised_form(turn):
 
 
 @pytest.mark.parametrize("factor", [0.25, 1.0, 9.0])
-def test_the_dispersion_is_the_factor_of_the_squared_scales(factor):
+def test_the_dispersion_is_the_factor_of_the_squared_scales(factor, optimize):
     """Squared radii of Student's t with nu = 3 in two dimensions are 2 F(2, nu) distributed."""
     squared = factor * 2.0 * np.random.default_rng(0).f(2.0, NU, 100_000)
     assert dispersion(squared, 60) == pytest.approx(factor, rel=0.03)
@@ -155,7 +154,7 @@ def test_the_dispersion_is_the_factor_of_the_squared_scales(factor):
     one = dispersion(squared, 1)
     assert abs(np.log(one)) < abs(np.log(factor)) + 0.01
     assert np.log(one) * np.log(factor) >= 0.0
-    of_scipy = minimize_scalar(
+    of_scipy = optimize.minimize_scalar(
         lambda v: np.log(v) + (NU + 2) / 2 * np.log1p(squared / (NU * v)).mean(),
         bounds=(0.01, 100.0),
         method="bounded",

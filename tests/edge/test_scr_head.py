@@ -3,7 +3,6 @@
 import msgspec
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 
 from cvo_edge import geometry
 from cvo_edge.bundle.format import Threshold
@@ -324,7 +323,7 @@ def test_disagreement_beyond_that_of_known_frames_is_a_doubt():
         assert solve(frame).doubt is Reason.IMAGE_UNFAMILIAR
 
 
-def test_the_fused_pose_minimises_the_sum_of_both_losses():
+def test_the_fused_pose_minimises_the_sum_of_both_losses(optimize):
     generator = np.random.default_rng(12)
     root = generator.normal(0.0, 30.0, (6, 6))
     information = root @ root.T + 100.0 * np.eye(6)
@@ -338,7 +337,7 @@ def test_the_fused_pose_minimises_the_sum_of_both_losses():
         apart = (e - offset) / (np.array(fusion.rho) * half_width)
         return fusion.kappa * e @ information @ e + fusion.share * apart @ apart
 
-    oracle = minimize(loss, np.zeros(6), method="BFGS", options={"gtol": 1e-9})
+    oracle = optimize.minimize(loss, np.zeros(6), method="BFGS", options={"gtol": 1e-9})
     pose, found, disagreement = fuse(solved, information, regression, half_width, fusion)
     np.testing.assert_allclose(error(pose, solved), oracle.x, atol=1e-5)
     assert disagreement == pytest.approx(oracle.fun / 6.0, rel=1e-3)
