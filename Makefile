@@ -11,7 +11,7 @@ METHODS := scr cjp cqr csp mcqr
 BUNDLE := calibration_artifacts/synthetic-room
 RUNTIME := $(shell find cvo_edge -type f -not -name "*.pyc")
 
-.PHONY: help demo test coverage check docs bench soak fuzz arm64 avx2 format clean
+.PHONY: help demo test coverage check docs bench wrong-frames soak fuzz arm64 avx2 format clean
 
 help: ## list all targets
 	@awk -F ':.*## ' '/^[a-z0-9 -]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -78,6 +78,16 @@ bench: $(VENV)/.installed ## measure speed, memory and start-up against other en
 	$(VENV)/bin/python bench/peers.py
 	$(VENV)/bin/python bench/uncertainty_peers.py
 	$(VENV)/bin/python bench/goals.py
+
+# RUNS: run folders to measure instead of the demonstration bundles.
+RUNS ?=
+wrong-frames: $(VENV)/.installed ## play 79 kinds of wrong frames through the demonstration bundles (RUNS: run folders instead)
+ifeq ($(RUNS),)
+	$(VENV)/bin/python bench/wrong_frames.py $(BUNDLE)-cjp synthetic:room,flights=100
+	$(VENV)/bin/python bench/wrong_frames.py $(BUNDLE)-scr synthetic:room,flights=100
+else
+	set -e; for run in $(RUNS); do $(VENV)/bin/python bench/wrong_frames.py $$run; done
+endif
 
 soak: $(VENV)/.installed ## process a million frames and watch memory; half an hour
 	$(VENV)/bin/python bench/soak.py

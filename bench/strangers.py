@@ -18,35 +18,23 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
+from played import CONFIDENCE, Image, Rows, Seen, by_recording, spread
 from provenance import write_result
+from wrong_kinds import KINDS, Kind, frame
 
 from cvo_edge.camera import Camera
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import PoseInterval, Reason
+from cvo_edge.estimate import Reason
 from cvo_edge.odometer import Odometer
 from cvo_edge.vocabulary import Scope
 from cvo_export.data.splits import same_split
 from cvo_export.datasets import PoseDataset, open_dataset
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
-Rows = NDArray[np.int64]
 Change = Callable[[Image], Image]
 
-CONFIDENCE = 0.9
 # Frames of another place, evenly spread over it.
 FRAMES = 200
-
-
-class Seen(NamedTuple):
-    """An estimate, the true pose (7,), the recording, and the frame's number in it, from 1."""
-
-    estimate: PoseInterval
-    truth: Array
-    recording: int
-    number: int
 
 
 class Stream(NamedTuple):
@@ -102,28 +90,33 @@ def run(
     seen = []
     estimate = None
     with Odometer(bundle, confidence=CONFIDENCE, scope=scope, camera=camera) as odometer:
-        for recording in np.unique(dataset.sequence[indices]):
-            rows = indices[dataset.sequence[indices] == recording].tolist()
+        for recording in by_recording(dataset, indices):
+            rows = recording.tolist()
             images = (np.ascontiguousarray(change(dataset.read_image(row))) for row in rows)
             for number, (row, found) in enumerate(zip(rows, odometer.stream(images), strict=True)):
-                seen.append(Seen(found, dataset.poses[row], int(recording), number + 1))
+                place = int(dataset.sequence[row])
+                seen.append(Seen(found, dataset.poses[row], place, number + 1))
             estimate = odometer.seen_camera or estimate
     return Stream(seen, estimate and float(np.sqrt(estimate.fx * estimate.fy)))
 
 
-def turned_90(image: Image) -> Image:
-    """Turn by a right angle, and stretch to the shape it had."""
-    return np.asarray(cv2.resize(np.rot90(image), image.shape[1::-1]), np.uint8)
+def alone(kind: Kind) -> Change:
+    """Return a kind as a change of one image."""
+    return lambda image: frame(kind, [image], 0)
 
 
+# Name in the results -> the kind's.
 ALTERED: dict[str, Change] = {
-    "mirrored": lambda image: image[:, ::-1],
-    "upside down": lambda image: image[::-1],
-    "turned by 90 degrees": turned_90,
-    "turned by 180 degrees": lambda image: image[::-1, ::-1],
-    "negative": lambda image: 255 - image,
-    "halves swapped": lambda image: np.roll(image, image.shape[1] // 2, axis=1),
-    "torn": lambda image: np.roll(image, image.shape[0] // 2, axis=0),
+    name: alone(KINDS[kind])
+    for name, kind in {
+        "mirrored": "mirrored",
+        "upside down": "upside down",
+        "turned by 90 degrees": "turned by 90 degrees",
+        "turned by 180 degrees": "turned by 180 degrees",
+        "negative": "negative",
+        "halves swapped": "halves swapped",
+        "torn": "rows rolled",
+    }.items()
 }
 
 
@@ -258,7 +251,7 @@ def main() -> None:
     print("other places, their cameras stated")
     for text in arguments.place:
         place = open_dataset(text)
-        rows = np.unique(np.linspace(0, len(place.poses) - 1, FRAMES).astype(np.int64))
+        rows = spread(np.arange(len(place)), FRAMES)
         found = run(bundle, place, rows, lambda image: image, place.camera())
         add("places", place.name, found.figures())
     if arguments.json:

@@ -22,6 +22,7 @@ import comparison_tables
 import localiser_tables
 import speed_tables
 import study_tables
+import vigilance_tables
 from goals import goals_table
 from provenance import ROOT
 from results_index import results_index
@@ -46,6 +47,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **study_tables.TABLES,
     **localiser_tables.TABLES,
     **speed_tables.TABLES,
+    **vigilance_tables.TABLES,
     "faults": faults,
     "goals": goals_table,
     "results": results_index,
