@@ -123,6 +123,7 @@ class Odometer:
             at_once=settings.workers,
         )
         self.chart = self._observer.chart
+        self.origin_m = self._observer.origin_m
         self._stream_checks = StreamChecks()
         self._camera_check = self._observer.camera_check()
         self._clock = SYSTEM_CLOCK
@@ -301,13 +302,17 @@ class Odometer:
             doubts += (Reason.CAMERA_DIFFERS,)
         if doubts:
             found = unbounded_set()
+        position_m = observation.pose[:3]
+        if self.origin_m is not None:
+            origin_m = np.array(self.origin_m)
+            position_m, found = position_m + origin_m, found.moved(origin_m)
         return PoseInterval(
             seq=processed.seq,
             stamp_ns=frame.stamp_ns,
             source=frame.source,
             status=Status.INVALID if fault else Status.DEGRADED if doubts else Status.OK,
             reasons=doubts or self._remarks(observation, found),
-            pose=None if fault else Pose(observation.pose[:3], observation.pose[3:]),
+            pose=None if fault else Pose(position_m, observation.pose[3:]),
             conformal_set=found,
             confidence=self.confidence,
             scope=self.scope,
@@ -344,7 +349,10 @@ class Odometer:
         return remarks
 
     def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
-        """Run the network on one image without applying a threshold; see ``Observer.observe``."""
+        """Run the network on one image without applying a threshold; see ``Observer.observe``.
+
+        Positions of the observation and of its ``conformal_set`` are relative to ``origin_m``.
+        """
         return self._observer.observe(image_bgr, seq)
 
     def solver_error(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -65,6 +66,13 @@ class Pose:
         T[:3, :3] = geometry.quaternion_to_matrix(self.q_xyzw)
         T[:3, 3] = self.t_m
         return T
+
+
+def about(poses: Array, origin_m: Sequence[float] | None) -> Array:
+    """World poses (..., 7) -> poses with positions relative to an origin; None changes nothing."""
+    if origin_m is None:
+        return poses
+    return np.concatenate([poses[..., :3] - np.asarray(origin_m), poses[..., 3:]], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,6 +118,25 @@ class ConformalSet:
             )
         return replace(self, lower=lower, upper=upper, bands=bands)
 
+    def moved(self, offset_m: Array) -> ConformalSet:
+        """Return the set with all positions moved by an offset (3,), in float64."""
+        step = np.concatenate([offset_m, np.zeros(3)])
+        bands, ellipsoids = self.bands, self.ellipsoids
+        if bands is not None:
+            bands = tuple(
+                tuple((low + by, high + by) for low, high in row)
+                for row, by in zip(bands, step.tolist(), strict=True)
+            )
+        if ellipsoids is not None:
+            ellipsoids = replace(ellipsoids, centres=ellipsoids.centres + step)
+        return replace(
+            self,
+            lower=self.lower + step,
+            upper=self.upper + step,
+            bands=bands,
+            ellipsoids=ellipsoids,
+        )
+
     def width(self) -> Array:
         """Return the width per DoF, (6,): the total length of the bands, not of their hull."""
         if self.bands is None:

@@ -37,6 +37,7 @@ SixOrUnbounded = tuple[
 ]
 Dtype = Literal["uint8", "float32"]
 Quaternion = tuple[Number, Number, Number, Number]
+Position = tuple[Number, Number, Number]
 Parameters = TypeVar("Parameters", bound=Struct)
 
 
@@ -98,8 +99,13 @@ class PoseLimits(_Strict, frozen=True):
     highest: Six
 
 
-class PoseSpec(_Strict, frozen=True):
-    """Meaning, reference frames and units of the six pose coordinates."""
+class PoseSpec(_Strict, frozen=True, omit_defaults=True):
+    """Meaning, reference frames and units of the six pose coordinates.
+
+    ``origin_m``: the world position that the model's outputs, the limits and the method's
+    parameters are relative to; null means the world's own origin. Positions far from it would lose
+    centimetres in float32. ``Odometer`` adds it in float64, so its estimates are world coordinates.
+    """
 
     target: Literal["absolute"]
     frame_id: Text
@@ -109,6 +115,7 @@ class PoseSpec(_Strict, frozen=True):
     units: tuple[Literal["m"], Literal["rad"]]
     limits: PoseLimits
     standard_deviation: SixPositive
+    origin_m: Position | None = None
 
 
 class Threshold(_Strict, frozen=True):

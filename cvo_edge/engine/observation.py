@@ -46,7 +46,8 @@ class Observation:
     outputs
         Model outputs by name, and what the method's solver adds, each with a leading axis of one.
     pose, point
-        Shape (7,) with a unit quaternion, and shape (6,): the same pose in the bundle's chart.
+        Shape (7,) with a unit quaternion, and shape (6,): the same pose in the bundle's chart. As
+        in the outputs, positions are relative to the bundle's ``origin_m``.
     fault
         Why these results must not be used, or None.
     doubt
@@ -128,6 +129,7 @@ class Observer:
         if reference is not None and pose.rotation == "tangent_predicted":
             self._limits_chart = Chart("tangent_reference", reference)
         self._limits = pose.limits
+        self.origin_m = pose.origin_m
 
     def __enter__(self) -> Self:
         """Return itself."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from cvo_edge.bundle.format import Calibration, CalibrationSpec
+from cvo_edge.bundle.format import Calibration, CalibrationSpec, Position
 from cvo_edge.camera import Camera
 from cvo_edge.conformal import least_draws
 from cvo_edge.engine.model_cache import ModelCache
@@ -35,6 +35,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         *_entry(
             "pose", f"{pose.target}, {pose.child_frame_id} in {pose.frame_id}, {pose.rotation}"
         ),
+        *([] if pose.origin_m is None else _entry("origin", _position(pose.origin_m))),
         *_entry(
             "calibrated",
             f"on {source.n} frames of {source.n_sequences} sequence(s) of {source.dataset}, split "
@@ -54,6 +55,10 @@ def inspect_lines(calibration: Calibration) -> list[str]:
             cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>10}" for v in values)
             lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<18}" + cells)
     return lines + _unbounded(calibration, head)
+
+
+def _position(position_m: Position) -> str:
+    return " ".join(f"{value:.10g}" for value in position_m) + " m in the world"
 
 
 def _camera(camera: Camera) -> str:

@@ -29,6 +29,7 @@ from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageE
 from cvo_edge.geometry import mean_rotation
 from cvo_edge.heads import HEADS, Candidate
 from cvo_edge.heads.cqr import CqrParameters
+from cvo_edge.pose import about
 from cvo_edge.vocabulary import Crop, Joint, Provider, Rule, Sides, SplitKind
 from cvo_export.bundles.draft import (
     CAMERA_FRAME,
@@ -280,6 +281,7 @@ def _with_any_rotation(limits: PoseLimits) -> PoseLimits:
 def _with_wider_limits(draft: Draft, poses: Array) -> Draft:
     """Widen a bundle's limits to include the poses (n, 7) of the new data."""
     pose = draft.pose
+    poses = about(poses, pose.origin_m)
     if pose.reference_q_xyzw is None:
         coordinates = known_coordinates(poses, mean_rotation(poses[:, 3:]))
         found = _with_any_rotation(plausible(coordinates, FEW_POSES_MARGIN))

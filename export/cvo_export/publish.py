@@ -159,7 +159,9 @@ def _draft(
     model = model_spec(model_bytes, OPSET, provider)
     # The score's unit and the limits use all train and fit frames, even if the run used a share
     # of them.
-    known = target.coordinates(run.dataset.poses[np.concatenate([roles["train"], roles["fit"]])])
+    known = target.coordinates(
+        run.dataset.local_poses[np.concatenate([roles["train"], roles["fit"]])]
+    )
     return Draft(
         name=name,
         method=run.graph.head.runtime_method,
@@ -184,6 +186,7 @@ def _draft(
             units=("m", "rad"),
             limits=plausible(known),
             standard_deviation=six(known.std(axis=0)),
+            origin_m=run.dataset.origin_m,
         ),
         provenance=Provenance(
             created_with=versions((*_PACKAGES, provider)),

@@ -8,9 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from cvo_edge import Odometer, Reason, Status, UsageError, open_source, read_bundle
+from cvo_edge.engine.loading import Bundle
 from cvo_edge.ground_truth import open_ground_truth
+from cvo_edge.programs.inspect import inspect_lines
 
 
 @pytest.fixture(scope="module")
@@ -205,3 +208,34 @@ def test_what_is_shown_of_bundle_and_odometer_is_short(bundle_dir):
     odometer.close()
     assert "closed" in repr(odometer)
     assert max(len(repr(bundle)), len(repr(odometer))) < 100
+
+
+@pytest.mark.parametrize("scope", ["marginal", "joint"])
+@pytest.mark.parametrize("method", ["cjp", "csp", "mcqr", "scr"])
+def test_an_origin_moves_all_that_an_estimate_says_of_positions(
+    artifacts_dir, frames, method, scope
+):
+    bundle = read_bundle(artifacts_dir / f"synthetic-room-{method}")
+    origin_m = (512.0, 5_000_000.0, -100.0)
+    pose = replace(bundle.calibration.pose, origin_m=origin_m)
+    moved = Bundle.of(replace(bundle.calibration, pose=pose), bundle.model)
+    assert "origin       512 5000000 -100 m in the world" in inspect_lines(moved.calibration)
+    step = np.array([*origin_m, 0.0, 0.0, 0.0])
+    with Odometer(bundle, scope=scope) as here, Odometer(moved, scope=scope) as there:
+        near, far = (each.step(frames[10].image) for each in (here, there))
+    assert far.status == near.status == "ok"
+    assert (far.pose.t_m == near.pose.t_m + origin_m).all()
+    assert (far.lower == near.lower + step).all()
+    assert (far.upper == near.upper + step).all()
+    one, other = near.conformal_set.ellipsoids, far.conformal_set.ellipsoids
+    if one is not None:
+        assert (other.centres == one.centres.astype(np.float64) + step).all()
+        assert (other.scale == one.scale).all()
+    if near.bands is not None:
+        for before, after, by in zip(near.bands, far.bands, step, strict=True):
+            assert (np.array(after) == np.array(before) + by).all()
+    inside = near.pose.to_array()
+    inside[:3] += origin_m
+    assert far.contains(inside) == near.contains(near.pose)
+    inside[1] = near.pose.t_m[1]
+    assert not far.contains(inside)

@@ -17,11 +17,13 @@ from cvo_edge.conformal import conformal_quantile
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
+from cvo_edge.pose import about
 from cvo_edge.programs.selftest import check_selftest
 from cvo_export.bundles.thresholds import observe
 from cvo_export.graph.to_onnx import check_parity, export_onnx
 from cvo_export.networks.heads.cjp import CjpConfig, CjpLearner, CjpNetwork, CjpPrediction
 from cvo_export.publish import publish
+from cvo_export.training import run as runs
 from cvo_export.training.loop import train
 
 from .conftest import ignore_progress, tiny_config
@@ -202,6 +204,70 @@ def test_a_run_of_several_members_becomes_a_bundle(tmp_path):
     run = train(tmp_path / "run", tiny_config(steps=100, head=head), ignore_progress)
     publish(run, tmp_path / "bundle", "two")
     assert read_bundle(tmp_path / "bundle").calibration.provenance.options["head.members"] == 2
+
+
+# A place in UTM coordinates: easting, northing, height.
+UTM_M = (5e5, 5e6, 100.0)
+
+
+def moved(dataset, offset_m):
+    poses = dataset.poses.copy()
+    poses[:, :3] += offset_m
+    return dataclasses.replace(dataset, poses=poses)
+
+
+@pytest.fixture(scope="module")
+def far_bundle(tiny_run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bundles") / "far"
+    run = dataclasses.replace(tiny_run, dataset=moved(tiny_run.dataset, UTM_M))
+    publish(run, folder, "far")
+    return folder
+
+
+@pytest.mark.parametrize("scope", ["marginal", "joint"])
+def test_estimates_of_a_far_place_are_world_coordinates(tiny_run, tiny_bundle, far_bundle, scope):
+    dataset, offset = tiny_run.dataset, np.array([*UTM_M, 0.0, 0.0, 0.0])
+    far_dataset, rows = moved(dataset, UTM_M), np.arange(0, 320, 16)
+    near_odometer = Odometer.load(tiny_bundle, scope=scope)
+    with near_odometer, Odometer.load(far_bundle, scope=scope) as far_odometer:
+        pose = near_odometer.calibration.pose, far_odometer.calibration.pose
+        assert [each.origin_m for each in pose] == [None, UTM_M]
+        assert pose[0].limits.lowest == pytest.approx(pose[1].limits.lowest, abs=1e-8)
+        for index in rows.tolist():
+            image = dataset.read_image(index)
+            near, far = near_odometer.step(image), far_odometer.step(image)
+            assert near.status == far.status == "ok"
+            assert far.pose.t_m - UTM_M == pytest.approx(near.pose.t_m, abs=1e-6)
+            assert far.lower - offset == pytest.approx(near.lower, abs=1e-6)
+            assert far.upper - offset == pytest.approx(near.upper, abs=1e-6)
+            truth = far_dataset.poses[index]
+            assert (far.covers(truth) == near.covers(dataset.poses[index])).all()
+        near_seen = observe(near_odometer, dataset, rows)
+        far_seen = observe(far_odometer, far_dataset, rows)
+    assert far_seen.true_pose == pytest.approx(near_seen.true_pose, abs=1e-6)
+    assert (far_seen.pose == near_seen.pose).all()
+
+
+def test_a_far_place_is_learned_as_if_it_were_near(tiny_run, tmp_path, monkeypatch):
+    far = moved(tiny_run.dataset, UTM_M)
+    monkeypatch.setattr(runs, "open_dataset", lambda text: far)
+    run = train(tmp_path / "far", tiny_config(steps=1, copies=0, warm_up_steps=0), ignore_progress)
+    for name in ("mean", "std", "reference_q_xyzw"):
+        expected = getattr(tiny_run.target, name)
+        assert getattr(run.target, name) == pytest.approx(expected, abs=1e-8)
+    stored = np.load(tmp_path / "far" / "features-0" / "copy-000.npz")
+    rows = np.concatenate([run.split.roles["train"], run.split.roles["fit"]])
+    assert stored["poses"] == pytest.approx(tiny_run.dataset.poses[rows], abs=1e-8)
+
+
+def test_only_a_far_place_has_an_origin(tiny_run):
+    dataset = tiny_run.dataset
+    assert dataset.origin_m is None
+    assert dataset.local_poses is dataset.poses
+    assert moved(dataset, (900.0, 0.0, 0.0)).origin_m is None
+    far = moved(dataset, (0.0, 1280.0, 30.0))
+    assert far.origin_m == (0.0, 1300.0, 0.0)
+    assert (far.local_poses == about(far.poses, (0.0, 1300.0, 0.0))).all()
 
 
 def test_a_damaged_image_costs_that_frame_only(tiny_bundle, tiny_run):

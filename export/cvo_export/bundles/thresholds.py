@@ -26,6 +26,7 @@ from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.heads import Candidate, Head
 from cvo_edge.odometer import Odometer
+from cvo_edge.pose import about
 from cvo_edge.programs.selftest import observe_selftest
 from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import SCOPES, Joint, Rule, Scope, Sides
@@ -52,8 +53,9 @@ class Observed:
     """The runtime's results for the n frames that passed the frame checks, stacked.
 
     ``outputs`` (n, ...) are the network's outputs by name; ``point`` and ``truth`` (n, 6) are in
-    the bundle's chart; ``pose`` and ``true_pose`` are (n, 7); ``sequence`` (n,) holds sequence
-    numbers; ``invalid`` and ``degraded`` count the frames that the checks excluded.
+    the bundle's chart; ``pose`` and ``true_pose`` are (n, 7); all positions are relative to the
+    bundle's origin. ``sequence`` (n,) holds sequence numbers; ``invalid`` and ``degraded`` count
+    the frames that the checks excluded.
     """
 
     indices: NDArray[np.int64]
@@ -117,7 +119,7 @@ def observe(
             f"{len(indices)}: {found}"
         )
     pose = np.array([observation.pose for observation in seen])
-    true_pose = dataset.poses[kept]
+    true_pose = about(dataset.poses[kept], observer.origin_m)
     return Observed(
         indices=np.array(kept),
         outputs={

@@ -10,6 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.camera import Camera, Distortion
+from cvo_edge.pose import about
+
+# A place whose middle is further than this from zero gets an origin of its own, of round numbers.
+_FAR_M, _ROUND_M = 1000.0, 100
 
 
 class Intrinsics(NamedTuple):
@@ -85,6 +89,24 @@ class PoseDataset:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def origin_m(self) -> tuple[float, float, float] | None:
+        """The position that a network of this place computes about; None if it is the world's own.
+
+        None if the median position is within a kilometre of the world's origin. Otherwise that
+        median, rounded, because float32 resolves 5e6 m, e.g. a UTM northing, to half a metre.
+        """
+        middle = np.median(self.poses[:, :3], axis=0)
+        if np.linalg.norm(middle) <= _FAR_M:
+            return None
+        x, y, z = (float(_ROUND_M * round(value / _ROUND_M)) for value in middle.tolist())
+        return x, y, z
+
+    @property
+    def local_poses(self) -> NDArray[np.float64]:
+        """Poses (n, 7) whose positions are relative to ``origin_m``."""
+        return about(self.poses, self.origin_m)
 
     def camera(self) -> Camera | None:
         """Return the camera with its image size and lens, or None if it is not stated.

@@ -35,7 +35,10 @@ Image = NDArray[np.uint8]
 
 
 class ModelImages:
-    """Frames of a data set as model inputs: (height, width, 3) uint8 RGB, kept in memory."""
+    """Frames of a data set as model inputs: (height, width, 3) uint8 RGB, kept in memory.
+
+    Their poses are relative to the data set's ``origin_m``.
+    """
 
     def __init__(
         self,
@@ -45,7 +48,7 @@ class ModelImages:
         width: int,
         crop: Crop,
     ) -> None:
-        self.poses = dataset.poses[indices]
+        self.poses = dataset.local_poses[indices]
         self.images = np.empty((indices.size, height, width, 3), dtype=np.uint8)
         camera = dataset.camera()
         # The camera whose images these are, or None.

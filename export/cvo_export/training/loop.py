@@ -72,7 +72,7 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     backbone, upper, weights_sha256 = loaded_backbone(config, config.weights)
     parts = training_frames(dataset, split, config.share)
     indices = np.concatenate(parts)
-    target = fit_target(dataset.poses[indices])
+    target = fit_target(dataset.local_poses[indices])
     claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
     images = ModelImages(dataset, indices, *size)
