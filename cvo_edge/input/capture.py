@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from threading import Event, Thread, current_thread
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -35,6 +35,9 @@ _OPENING = 2.0
 _PARTS = 20
 # Releasing a device takes milliseconds.
 _RELEASE_S = 1.0
+
+# FFmpeg's decoders that draw characters: a pipe or an address may give a text, too.
+_DRAWN = frozenset(int.from_bytes(name, "little") for name in (b"ansi", b"xbin"))
 
 T = TypeVar("T")
 
@@ -124,7 +127,10 @@ class Capture:
         if found is None:
             self.close()
             raise SourceError(f"{shown(device)}: did not open as a video or camera")
-        return found
+        if found.codec in _DRAWN:
+            self.close()
+            raise SourceError(f"{shown(device)}: expected a video or camera, found text")
+        return found.fps, found.frames
 
     def read(self) -> Grabbed | None:
         """Return the next image, or None at the end and for a frame that does not decode.
@@ -188,6 +194,14 @@ def _end(
         thread.join(_RELEASE_S)
 
 
+class _Stated(NamedTuple):
+    """Frame rate, number of frames (0 if unknown) and codec (a FourCC) of an opened device."""
+
+    fps: float
+    frames: int
+    codec: int
+
+
 class _Opened:
     """The capture and the ages of its frames; only the reading thread uses it."""
 
@@ -196,20 +210,21 @@ class _Opened:
         self._account = LagAccount(clock.now_s(), 0.0)
         self._driver: DriverStamps | None = None
 
-    def open(self, device: int | str) -> tuple[float, int] | None:
-        """Open the device; return its frame rate and number of frames, None if it does not open."""
+    def open(self, device: int | str) -> _Stated | None:
+        """Open the device; return what it states of itself, None if it does not open."""
         begin = self._clock.now_s()
         try:
             if not self._capture.open(device):
                 return None
             fps, count = map(self._capture.get, (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
             backend = self._capture.getBackendName()
+            codec = int(self._capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         except cv2.error:
             return None
         self._account = LagAccount(begin, fps)
         # Video4Linux reports the driver's stamp as the position; other backends count from a start.
         self._driver = DriverStamps() if backend == "V4L2" else None
-        return fps, int(count) if 0.0 < count < math.inf else 0
+        return _Stated(fps, int(count) if 0.0 < count < math.inf else 0, codec)
 
     def grab(self) -> Grabbed | None:
         """Return the next image, None if there is none."""

@@ -19,6 +19,7 @@ from typing import SupportsIndex, TypeVar
 from cvo_edge.errors import SourceError, UsageError, printable
 from cvo_edge.input.capture import TIMEOUT_S, Capture, Reader, shown
 from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
+from cvo_edge.input.containers import check_video
 from cvo_edge.input.decoding import is_image
 from cvo_edge.input.frame import Frame, Source
 from cvo_edge.input.image_files import (
@@ -128,6 +129,7 @@ class Video:
     _UNREADABLE_IN_A_ROW = 100
 
     def __init__(self, path: Path, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
+        check_video(path)
         self._path = path
         self._capture = Capture(str(path), timeout_s)
         own_fps, announced = self._capture.open()

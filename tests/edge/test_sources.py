@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.input.capture import READER
+from cvo_edge.input.capture import READER, Capture
+from cvo_edge.input.containers import is_video
 from cvo_edge.input.decoding import decode_image
 from cvo_edge.input.sources import Video, _VideoStamps, open_source
 
@@ -251,11 +252,90 @@ def test_a_program_that_has_read_a_video_ends_as_it_wants_to(video):
         assert (done.returncode, done.stdout) == (0, "20\n"), done.stderr
 
 
-def test_a_text_file_is_no_video(tmp_path):
-    path = tmp_path / "video.avi"
-    path.write_text("not a video")
-    with pytest.raises(SourceError, match="did not open as a video"):
+NUMBERS = b"1.5 0.25 -3.75 0 0 0 1\n" * 40
+TRAJECTORY = b"# timestamp tx ty tz qx qy qz qw\n1305031098.6659 1.35 0.63 1.64 0.6 0.6 -0.3 -0.3\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "found"),
+    [
+        ("a.txt", NUMBERS, "text"),
+        ("groundtruth.txt", TRAJECTORY, "text"),
+        ("a.ans", b"\x1b[31mred\x1b[0m\n" * 20, "text"),
+        ("a.txt", b"GG" * 4000, "text"),
+        ("a.txt", b"1234ftypisom" + NUMBERS, "text"),
+        ("a.txt", "1 2 3".encode("utf-16"), "text"),
+        ("list.mp4", b"ffconcat version 1.0\nfile clip.avi\n", "text"),
+        ("list.m3u8", b"#EXTM3U\n#EXTINF:1,\nclip.avi\n#EXT-X-ENDLIST\n", "text"),
+        ("a.gif", b"GIF89a" + bytes(32), "another kind of file"),
+        ("a.heic", b"\0\0\0\x18ftypheic" + bytes(32), "another kind of file"),
+        ("a.ico", b"\0\0\1\0\1\0" + bytes(32), "another kind of file"),
+        ("a.wav", b"RIFF\x24\0\0\0WAVEfmt " + bytes(32), "another kind of file"),
+        ("a.ts", b"G" + bytes(187) + b"X" + bytes(187) + b"G" + bytes(187), "another kind of file"),
+        ("empty.avi", b"", "an empty file"),
+    ],
+)
+def test_what_is_no_video_of_a_camera_is_refused(tmp_path, video, name, content, found):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(SourceError) as refused:
         open_source(str(path))
+    assert str(refused.value) == (
+        f"{path}: expected images or a video (MP4, MOV, MKV, WebM, AVI, MPEG, FLV, WMV, Ogg, MXF, "
+        f"DV, IVF, Y4M, H.264, H.265, MJPEG), found {found}"
+    )
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        b"\0\0\0\x20ftypisom",
+        b"\0\0\0\x14ftypqt  ",
+        b"\0\0\0\x08wide\0\1\0\0mdat",
+        b"\x7f\0\1\0mdat",
+        b"\x1a\x45\xdf\xa3\x9f\x42\x86\x81\1",
+        b"RIFF\0\1\0\0AVI LIST",
+        b"FLV\1\5\0\0\0\x09",
+        b"OggS\0\2",
+        b"G\x40\0\x10" + bytes(184) + b"G\1\0\x10" + bytes(184) + b"G\1\0\x11" + bytes(184),
+        (bytes(4) + b"G\x40" + bytes(186)) * 3,
+        b"\0\0\1\xba\x44\0\4",
+        b"\0\0\1\xb3\x14\0\xf0",
+        b"\0\0\0\1\x67\x42\0\x1f",
+        b"\0\0\1\x09\xf0\0\0\1\x67",
+        b"\0\0\0\1\x40\1\x0c\1",
+        b"YUV4MPEG2 W64 H48 F30:1\nFRAME\n",
+        b"DKIF\0\0\x20\0VP80",
+        b"\xff\xd8\xff\xe0\0\x10JFIF\0",
+    ],
+)
+def test_containers_and_streams_of_cameras_are_known_by_their_start(start):
+    assert is_video(start)
+    assert not is_video(b" " + start)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec"), [("mp4", "mp4v"), ("mov", "mp4v"), ("mkv", "MJPG"), ("webm", "VP80")]
+)
+def test_videos_of_other_containers_are_read(tmp_path, suffix, codec):
+    path = tmp_path / f"clip.{suffix}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 20.0, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV does not write it")
+    for value in range(3):
+        writer.write(picture(value))
+    writer.release()
+    assert [frame.image.shape for frame in open_source(str(path))] == [(48, 64, 3)] * 3
+
+
+def test_text_that_comes_through_a_pipe_is_refused(tmp_path):
+    path = tmp_path / "a.txt"
+    os.mkfifo(path)
+    writer = threading.Thread(target=path.write_bytes, args=(NUMBERS * 100,))
+    writer.start()
+    with pytest.raises(SourceError, match=r"a.txt: expected a video or camera, found text$"):
+        Capture(str(path), 30.0).open()
+    writer.join()
 
 
 def test_a_camera_that_is_not_there_is_refused():
