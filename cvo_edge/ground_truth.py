@@ -13,6 +13,7 @@ from cvo_edge import geometry
 from cvo_edge.errors import SourceError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.files import read_regular_file
+from cvo_edge.input.image_files import frame_name
 
 Array = NDArray[np.float64]
 
@@ -88,7 +89,7 @@ class GroundTruth:
     def pose_of(self, estimate: PoseInterval) -> Array | None:
         """Return the true ``T_world_camera`` (7,) of an estimate's frame, or None."""
         if self._by_name:
-            return self._by_name.get(Path(estimate.source).stem.removesuffix(".color"))
+            return self._by_name.get(frame_name(estimate.source))
         if estimate.stamp_ns is None:
             return None
         nearest = nearest_stamp(self._stamps_ns, estimate.stamp_ns, MAX_STAMP_DIFFERENCE_NS)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from time import perf_counter
+from typing import NamedTuple
 
 from cvo_edge.errors import SourceError
 from cvo_edge.files import read_regular_file
@@ -15,6 +17,22 @@ from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image
 from cvo_edge.input.frame import Frame
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
+
+
+# Words in a file's name that say what the image shows.
+_COLOUR = frozenset(("color", "colour", "rgb"))
+_NO_COLOUR = frozenset(
+    ("depth", "disp", "disparity", "mask", "ir", "infrared", "normal", "normals")
+)
+_WORD = re.compile("[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_COLOUR_SUFFIX = re.compile("[._-](color|colour|rgb)$")
+
+
+class Listing(NamedTuple):
+    """The images to use, in natural order, and the number of images left out, by reason."""
+
+    images: list[Path]
+    left_out: dict[str, int]
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
@@ -32,9 +50,11 @@ class ImageFiles:
 
     live = False
 
-    def __init__(self, paths: list[Path], fps: float | None, if_empty: str) -> None:
+    def __init__(self, listing: Listing, fps: float | None, if_empty: str) -> None:
+        paths, self.left_out = listing
         if not paths:
-            raise SourceError(if_empty)
+            reasons = f"; left out {left_out_text(self.left_out)}" if self.left_out else ""
+            raise SourceError(if_empty + reasons)
         self._paths = paths
         self._fps = fps
         self.length: int | None = len(paths)
@@ -61,20 +81,46 @@ def _read_file(path: Path, stamp_ns: int | None) -> Frame:
     return Frame(image, stamp_ns, shown(path.name), spent)
 
 
-def images_in(folder: Path) -> list[Path]:
-    """Return the images of a folder in natural order, without hidden files."""
+def images_in(folder: Path) -> Listing:
+    """Return the images of a folder, without hidden files; see ``colour_images``."""
     # macOS leaves a hidden file beside each file on a card.
     return colour_images(
         [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     )
 
 
-def colour_images(paths: list[Path]) -> list[Path]:
-    """Return the images among files in natural order, only ``*.color.*`` if there are any."""
-    images = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
-    images = [path for path in images if ".depth." not in path.name]
-    colour = [path for path in images if ".color." in path.name]
-    return sorted(colour or images, key=natural_key)
+def colour_images(paths: Iterable[Path]) -> Listing:
+    """Return the images among files by the marks in their names.
+
+    A mark is a word of the name, e.g. ``depth`` in ``00001-depth.png``. Images marked as anything
+    but colour are left out; if some of the others are marked as colour, only those are used.
+    """
+    unmarked: list[Path] = []
+    colour: list[Path] = []
+    left_out: Counter[str] = Counter()
+    for path in paths:
+        if path.suffix.lower() not in IMAGE_SUFFIXES:
+            continue
+        words = {word.lower() for word in _WORD.findall(path.stem)}
+        if words & _NO_COLOUR:
+            left_out[f"marked {min(words & _NO_COLOUR)}"] += 1
+        else:
+            (colour if words & _COLOUR else unmarked).append(path)
+    if colour and unmarked:
+        left_out["not marked as colour"] = len(unmarked)
+    return Listing(sorted(colour or unmarked, key=natural_key), dict(sorted(left_out.items())))
+
+
+def left_out_text(left_out: Mapping[str, int]) -> str:
+    """Return the number of images left out and the reasons: ``50 images: marked depth 50``."""
+    count = sum(left_out.values())
+    reasons = ", ".join(f"{reason} {number}" for reason, number in left_out.items())
+    return f"{count} image{'' if count == 1 else 's'}: {reasons}"
+
+
+def frame_name(file_name: str) -> str:
+    """Return an image's name without suffix and mark: ``00001`` for ``00001-color.png``."""
+    return _COLOUR_SUFFIX.sub("", Path(file_name).stem)
 
 
 def stamp_at(seq: int, fps: float | None) -> int | None:

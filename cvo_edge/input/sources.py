@@ -25,6 +25,7 @@ from cvo_edge.input.frame import Frame, Source
 from cvo_edge.input.image_files import (
     IMAGE_SUFFIXES,
     ImageFiles,
+    Listing,
     colour_images,
     images_in,
     stamp_at,
@@ -53,9 +54,10 @@ def open_source(
     Parameters
     ----------
     source
-        Folder of images (natural order; only ``*.color.*`` if there are any, never ``*.depth.*`` or
-        hidden files), a glob pattern, a video file, a camera index such as ``0``, a device path
-        such as ``/dev/video0``, a named pipe, or the address of a stream such as ``rtsp://...``.
+        Folder of images (natural order, without hidden files; which ones by the marks in their
+        names, see ``colour_images``), a glob pattern, a video file, a camera index such as ``0``,
+        a device path such as ``/dev/video0``, a named pipe, or the address of a stream such as
+        ``rtsp://...``.
     fps
         Frames per second to stamp frames with, starting at zero, instead of the source's own.
     timeout_s
@@ -86,7 +88,7 @@ def open_source(
         return Camera(int(text) if text.isdecimal() else text, fps, timeout_s)
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES or _is_one_image(path):
-            return ImageFiles([path], fps, "")
+            return ImageFiles(Listing([path], {}), fps, "")
         return Video(path, fps, timeout_s)
     if glob.has_magic(text):
         found = [Path(name) for name in glob.glob(text, recursive=True) if Path(name).is_file()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import islice
@@ -16,6 +16,7 @@ from cvo_edge.camera_check import LensEstimate
 from cvo_edge.estimate import PoseInterval, Status
 from cvo_edge.ground_truth import GroundTruth
 from cvo_edge.input.frame import Source
+from cvo_edge.input.image_files import ImageFiles, left_out_text
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.measure import LatencyProfile, memory_mib
 
@@ -33,7 +34,7 @@ class RunSummary:
     gap in some degree of freedom; ``skipped`` counts frames dropped for a newer one; ``matched``
     counts frames that have a true pose, ``compared`` those of status ok among them, and ``covered``
     those whose set holds the true value, per degree of freedom; ``camera`` is what the frames show
-    of the camera, if they do.
+    of the camera, if they do; ``left_out`` counts the images of a folder that are no frames.
     """
 
     dof: tuple[str, ...]
@@ -52,6 +53,7 @@ class RunSummary:
     covered: Array = field(default_factory=lambda: np.zeros(6))
     covered_jointly: int = 0
     camera: LensEstimate | None = None
+    left_out: Mapping[str, int] = field(default_factory=dict)
     # Frames are numbered from 0, so that dropped frames at the start are counted, too.
     _last_seq: int = -1
 
@@ -82,6 +84,8 @@ class RunSummary:
         """Return the summary as lines of readable text."""
         counts = ", ".join(f"{self.statuses[status]} {status}" for status in Status)
         lines = [f"frames      {self.frames}: {counts}; {self.bounded} with finite bounds"]
+        if self.left_out:
+            lines.append(f"left out    {left_out_text(self.left_out)}")
         if self.skipped:
             lines.append(f"dropped     {self.skipped} frames, for newer ones")
         if self.disjoint:
@@ -142,6 +146,8 @@ def run(
     The caller owns the summary and can show it even if the source ends early. ``tick`` is called
     after each frame.
     """
+    if isinstance(frames, ImageFiles):
+        summary.left_out = frames.left_out
     try:
         with closing(odometer.stream(frames)) as estimates:
             for estimate in islice(estimates, max_frames):

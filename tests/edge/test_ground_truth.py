@@ -67,6 +67,8 @@ def test_folder_is_matched_by_frame_name(tmp_path):
         truth.pose_of(frame("frame-000007.color.jpg")), [0, 0, 0, 0, 0, 0, 1]
     )
     assert truth.pose_of(frame("frame-000008.color.jpg")) is None
+    for name in ("frame-000007-color.png", "frame-000007_rgb.jpg", "frame-000007.png"):
+        assert truth.pose_of(frame(name)) is not None
 
 
 def test_tum_is_matched_by_the_nearest_stamp_within_twenty_milliseconds(tmp_path):

@@ -6,6 +6,7 @@ import sys
 import threading
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -14,6 +15,7 @@ from cvo_edge import Odometer, Reason, Status, UsageError, open_source, read_bun
 from cvo_edge.engine.loading import Bundle
 from cvo_edge.ground_truth import open_ground_truth
 from cvo_edge.programs.inspect import inspect_lines
+from cvo_edge.programs.run import RunSummary, run
 
 
 @pytest.fixture(scope="module")
@@ -239,3 +241,13 @@ def test_an_origin_moves_all_that_an_estimate_says_of_positions(
     assert far.contains(inside) == near.contains(near.pose)
     inside[1] = near.pose.t_m[1]
     assert not far.contains(inside)
+
+
+def test_the_summary_counts_images_that_are_no_frames(bundle_dir, frames, tmp_path):
+    for mark in ("color", "depth"):
+        assert cv2.imwrite(str(tmp_path / f"1-{mark}.png"), frames[0].image)
+    with Odometer.load(bundle_dir) as odometer:
+        summary = RunSummary(odometer.chart.dof, 0.9, "marginal")
+        run(odometer, open_source(tmp_path), lambda _: None, summary=summary)
+    assert summary.frames == 1
+    assert "left out    1 image: marked depth 1" in summary.lines()

@@ -119,6 +119,39 @@ def test_hidden_files_are_no_frames(tmp_path):
     assert names(open_source(str(tmp_path))) == ["0.png"]
 
 
+@pytest.mark.parametrize(
+    ("files", "used", "left_out"),
+    [
+        ("1-color.png 1-depth.png 2-color.png 2-depth.png", [0, 2], {"marked depth": 2}),
+        ("f.color.jpg f.depth.png f.jpg", [0], {"marked depth": 1, "not marked as colour": 1}),
+        ("rgb0001.png ir0001.png", [0], {"marked ir": 1}),
+        ("RGBImage1.png DepthImage1.png left_RGB_2.png", [0, 2], {"marked depth": 1}),
+        ("0001.png 0001_mask.png 0001.normals.png", [0], {"marked mask": 1, "marked normals": 1}),
+        ("colour_1.png 1_disp.png 2_rgb_depth.png", [0], {"marked depth": 1, "marked disp": 1}),
+        # Marks are whole words.
+        ("first.png masked.png depths.png normalised.png bird.png", [0, 1, 2, 3, 4], {}),
+    ],
+)
+def test_marks_in_names_decide_which_images_of_a_folder_are_used(tmp_path, files, used, left_out):
+    for file in files.split():
+        write(tmp_path / file)
+    expected = [files.split()[number] for number in used]
+    for source in (open_source(str(tmp_path)), open_source(f"{tmp_path}/*")):
+        assert sorted(names(source)) == sorted(expected)
+        assert source.left_out == left_out
+
+
+def test_a_folder_without_colour_images_says_what_it_left_out(tmp_path):
+    write(tmp_path / "1-depth.png")
+    write(tmp_path / "2-mask.png")
+    with pytest.raises(SourceError) as refused:
+        open_source(str(tmp_path))
+    assert str(refused.value) == (
+        f"{tmp_path}: expected images, found none; left out 2 images: marked depth 1, marked mask 1"
+    )
+    assert names(open_source(str(tmp_path / "1-depth.png"))) == ["1-depth.png"]
+
+
 @pytest.mark.parametrize("name", ["a.jpe", "a.jfif", "a", "a.pbm", "a.mp4"])
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".ppm"])
 def test_one_image_is_an_image_whatever_its_name(tmp_path, name, suffix):

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from cvo_edge.errors import SourceError
 from cvo_edge.pose import Pose
 from cvo_export.datasets import open_dataset
+from cvo_export.datasets.describe import describe
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
 
 TURN = Rotation.from_rotvec([0.3, -0.5, 2.9])  # all quaternion components differ
@@ -54,6 +55,8 @@ def test_images_are_colour_and_the_camera_is_scaled_to_them(tmp_path):
     found = open_rgbd_scenes(str(scene(tmp_path)))
     assert found.read_image(2).shape == (48, 64, 3)
     assert found.read_image(2)[0, 0].tolist() == [20, 20, 20]
+    assert found.left_out == {"marked depth": 3}
+    assert "left out    3 images: marked depth 3" in describe(found)
     assert found.intrinsics == pytest.approx((57.03, 57.03, 32, 24))
 
 

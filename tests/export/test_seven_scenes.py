@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from cvo_edge import open_source
 from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.pose import Pose
 from cvo_export.datasets import open_dataset
@@ -42,6 +43,19 @@ def test_lost_tracking_and_missing_poses_are_skipped_and_counted(tmp_path):
     found = open_seven_scenes(str(root))
     assert len(found) == 4
     assert found.skipped == {"invalid pose": 1, "no pose file": 1}
+
+
+@pytest.mark.parametrize("suffix", [".color.png", "_rgb.jpg", "-color.png", ".jpg"])
+def test_the_runtime_and_the_training_side_choose_the_same_images(tmp_path, suffix):
+    folder = scene(tmp_path, 1, suffix=suffix) / "seq-01"
+    for frame in range(3):
+        cv2.imwrite(str(folder / f"frame-{frame:06d}.depth.png"), np.zeros((48, 64), np.uint16))
+        cv2.imwrite(str(folder / f"frame-{frame:06d}_mask.png"), np.zeros((48, 64), np.uint8))
+    found = open_seven_scenes(str(tmp_path))
+    source = open_source(folder)
+    assert found.frame_names == tuple(f"seq-01/frame-{frame:06d}" for frame in range(3))
+    assert [frame.source for frame in source] == [f"frame-{n:06d}{suffix}" for n in range(3)]
+    assert found.left_out == source.left_out == {"marked depth": 3, "marked mask": 3}
 
 
 def test_own_lists_name_sequences_by_number(tmp_path):

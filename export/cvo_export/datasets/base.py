@@ -73,6 +73,8 @@ class PoseDataset:
         Sequence indices of the data set's own train and test lists; empty if it has no lists.
     skipped
         Number of frames that the reader left out, by reason.
+    left_out
+        Number of images beside the frames that show no colour, e.g. depth, by reason.
     """
 
     name: str
@@ -86,6 +88,7 @@ class PoseDataset:
     own_train: frozenset[int] = frozenset()
     own_test: frozenset[int] = frozenset()
     skipped: Mapping[str, int] = field(default_factory=dict)
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.poses)

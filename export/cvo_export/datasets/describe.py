@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cvo_edge.input.image_files import left_out_text
 from cvo_export.datasets.base import PoseDataset, skipped_text
 
 
@@ -32,6 +33,7 @@ def describe(dataset: PoseDataset) -> list[str]:
     counts = np.bincount(dataset.sequence, minlength=len(dataset.sequence_names))
     return [
         summary(dataset),
+        *([f"left out    {left_out_text(dataset.left_out)}"] if dataset.left_out else []),
         f"image       {width} x {height} px",
         f"camera      {camera}",
         "positions   " + ", ".join(f"{axis} {a:.2f} .. {b:.2f}" for axis, a, b in extent) + " m",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
 from cvo_edge.input.decoding import decode_image
+from cvo_edge.input.image_files import frame_name, images_in
 from cvo_export.datasets.base import PoseDataset, skipped_text
 
 Array = NDArray[np.float64]
@@ -28,6 +29,13 @@ class FrameList:
         self._sequence_names: dict[str, int] = {}
         self._frame_names: dict[str, None] = {}
         self._skipped: Counter[str] = Counter()
+        self._left_out: Counter[str] = Counter()
+
+    def colour_images(self, folder: Path) -> list[Path]:
+        """Return the colour images of a folder, as the runtime chooses them; count the others."""
+        listing = images_in(folder)
+        self._left_out.update(listing.left_out)
+        return listing.images
 
     def add(self, sequence: str, name: str, image: Path, pose: Array | None) -> None:
         """Add a frame with its ``T_world_camera`` (7,), or count it as skipped.
@@ -59,7 +67,7 @@ class FrameList:
                 self.skip("no pose")
             else:
                 image = images[number]
-                self.add(sequence, image.stem.removesuffix("-color"), image, poses[number])
+                self.add(sequence, frame_name(image.name), image, poses[number])
 
     def skip(self, reason: str) -> None:
         """Count a skipped frame."""
@@ -78,6 +86,7 @@ class FrameList:
             frame_names=tuple(self._frame_names),
             read_image=image_reader(self._images),
             skipped=dict(self._skipped),
+            left_out=dict(self._left_out),
         )
 
 

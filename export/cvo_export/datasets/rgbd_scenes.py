@@ -45,7 +45,7 @@ def open_rgbd_scenes(path: str) -> PoseDataset:
     frames = FrameList(folder)
     images = {
         int(file.name.removesuffix(_COLOUR)): file
-        for file in folder.glob("*" + _COLOUR)
+        for file in frames.colour_images(folder)
         if file.name.removesuffix(_COLOUR).isdecimal()
     }
     pose_file = folder.parent.parent / "pc" / f"{folder.name.removeprefix('scene_')}.pose"

@@ -1,4 +1,4 @@
-"""7-Scenes (Shotton et al. 2013): ``seq-NN/frame-NNNNNN.color.png|jpg`` with ``.pose.txt``.
+"""7-Scenes (Shotton et al. 2013): ``seq-NN/frame-NNNNNN.color.png`` with ``.pose.txt``.
 
 A pose file contains the 4x4 camera-to-world matrix in metres, for an OpenCV camera.
 ``TrainSplit.txt`` and ``TestSplit.txt`` list ``sequenceN``. A folder with the frames of a single
@@ -16,12 +16,10 @@ import numpy as np
 
 from cvo_edge.errors import SinkError, SourceError
 from cvo_edge.ground_truth import MATRIX_SUFFIX, read_pose_matrix
-from cvo_edge.input.image_files import natural_key
+from cvo_edge.input.image_files import frame_name, natural_key
 from cvo_edge.pose import Pose
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.frames import FrameList
-
-_COLOUR = (".color.png", ".color.jpg")
 
 # The Kinect's nominal focal length at 640x480, as stated by the data set's authors.
 _NOMINAL_FOCAL_PX, _NOMINAL_WIDTH = 585.0, 640
@@ -43,8 +41,8 @@ def open_seven_scenes(path: str) -> PoseDataset:
     folders = [folder for folder in folders if folder.is_dir()] or [root]
     frames = FrameList(root)
     for folder in folders:
-        for image in _colour_images(folder):
-            name = image.name.split(".")[0]
+        for image in frames.colour_images(folder):
+            name = frame_name(image.name)
             pose_file = folder / (name + MATRIX_SUFFIX)
             if pose_file.is_file():
                 frames.add(folder.name, name, image, read_pose_matrix(pose_file))
@@ -80,11 +78,6 @@ def write_sequence(dataset: PoseDataset, sequence: int, folder: Path, frames: in
     except OSError as error:
         raise SinkError(f"{folder}: cannot be written: {error.strerror}") from None
     return int(indices.size)
-
-
-def _colour_images(folder: Path) -> list[Path]:
-    found = [path for suffix in _COLOUR for path in folder.glob("*" + suffix)]
-    return sorted(found, key=natural_key)
 
 
 def _own_list(path: Path, names: tuple[str, ...]) -> frozenset[int]:
