@@ -222,8 +222,10 @@ class Odometer:
         Parameters
         ----------
         image_bgr
-            Shape (height, width, 3), uint8, BGR as read by OpenCV; grey images, alpha channels and
-            16 bits are converted. None, or anything but an image, gives an ``invalid`` estimate.
+            Shape (height, width, 3), uint8, BGR, in the sensor's pixel order, as read by
+            ``cv2.imread`` with ``cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION``; grey images,
+            alpha channels and 16 bits are converted. None, or anything but an image, gives an
+            ``invalid`` estimate.
         stamp_ns
             Time of the image in integer nanoseconds; copied to the result.
         source

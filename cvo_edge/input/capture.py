@@ -216,6 +216,8 @@ class _Opened:
         try:
             if not self._capture.open(device):
                 return None
+            # As for image files: pixels in the sensor's order, whatever the container asks for.
+            self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
             fps, count = map(self._capture.get, (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
             backend = self._capture.getBackendName()
             codec = int(self._capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF

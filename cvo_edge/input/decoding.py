@@ -34,7 +34,8 @@ _BARE = frozenset((0x01, *range(0xD0, 0xDA)))
 # Decoders differ in whether a carriage return ends a comment, so a comment with one is refused.
 _GAP = rb"\s+(?:#[^\r\n]*\n\s*)*"
 _PNM = re.compile(rb"P[1-6]" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})\s")
-_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_TILE = 256, 257, (322, 323)
+_TIFF_STARTS = (b"II*\0", b"MM\0*")
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_TILE, _TIFF_ORIENTATION = 256, 257, (322, 323), 274
 # TIFF's 16 and 32 bit unsigned numbers.
 _TIFF_NUMBERS = {3: "H", 4: "I"}
 
@@ -43,15 +44,18 @@ def decode_image(content: bytes) -> NDArray[np.uint8] | None:
     """Decode an image file to (height, width, 3) uint8 BGR; None if it is damaged or unsupported.
 
     JPEG, PNG, BMP, PNM, TIFF and WebP are recognised by their first bytes. Grey is repeated, alpha
-    dropped, 16 bits keep their upper eight, and the sensor's pixel order is kept (no EXIF
-    rotation). The result is None for other formats, for a header that contradicts itself or asks
-    for more than ``MAX_PIXELS``, and for an incomplete file: some OpenCV versions decode a cut JPEG
-    to a wrong picture of full size, so its end marker is checked first. Altered bytes within a
-    JPEG's data mostly pass because, unlike PNG, it has no checksum.
+    dropped, 16 bits keep their upper eight, and pixels keep the order in which they are stored, the
+    sensor's (no rotation by EXIF or TIFF's tag 274). The result is None for other formats, for a
+    header that contradicts itself or asks for more than ``MAX_PIXELS``, and for an incomplete file:
+    some OpenCV versions decode a cut JPEG to a wrong picture of full size, so its end marker is
+    checked first. Altered bytes within a JPEG's data mostly pass because, unlike PNG, it has no
+    checksum.
     """
     size = image_size(content)
     if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
         return None
+    if content.startswith(_TIFF_STARTS):
+        content = _unturned(content)
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), _FLAGS)
     except (cv2.error, MemoryError):
@@ -132,23 +136,47 @@ def _pnm(content: bytes) -> tuple[int, int] | None:
 
 
 def _tiff(content: bytes) -> tuple[int, int] | None:
-    """Read the size of the first picture; each tag has a number, type, count and value.
+    """Read the size of the first picture.
 
     None if a tag occurs twice, or if tiles are larger than ``MAX_PIXELS``.
+    """
+    order, tags = _tiff_tags(content)
+    found = {}
+    for tag, place in tags:
+        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT, *_TIFF_TILE):
+            if tag in found:
+                return None
+            (kind,) = struct.unpack_from(order + "H", content, place + 2)
+            (found[tag],) = struct.unpack_from(order + _TIFF_NUMBERS[kind], content, place + 8)
+    tile = math.prod(found.get(tag, 1) for tag in _TIFF_TILE)
+    return (found[_TIFF_HEIGHT], found[_TIFF_WIDTH]) if tile <= MAX_PIXELS else None
+
+
+def _tiff_tags(content: bytes) -> tuple[str, list[tuple[int, int]]]:
+    """Return the byte order, and number and place of each tag of the first picture.
+
+    A tag has a number, a type, a count and a value, in twelve bytes.
     """
     order = "<" if content.startswith(b"II") else ">"
     (begin,) = struct.unpack_from(order + "I", content, 4)
     (count,) = struct.unpack_from(order + "H", content, begin)
-    found = {}
-    for number in range(count):
-        place = begin + 2 + 12 * number
-        tag, kind, _ = struct.unpack_from(order + "HHI", content, place)
-        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT, *_TIFF_TILE):
-            if tag in found:
-                return None
-            (found[tag],) = struct.unpack_from(order + _TIFF_NUMBERS[kind], content, place + 8)
-    tile = math.prod(found.get(tag, 1) for tag in _TIFF_TILE)
-    return (found[_TIFF_HEIGHT], found[_TIFF_WIDTH]) if tile <= MAX_PIXELS else None
+    places = range(begin + 2, begin + 2 + 12 * count, 12)
+    return order, [(struct.unpack_from(order + "H", content, at)[0], at) for at in places]
+
+
+def _unturned(content: bytes) -> bytes:
+    """Return a TIFF, whose header has been read, that asks for no rotation.
+
+    OpenCV has no option for it: it mirrors orientations 2 to 4 and swaps the sides of the others.
+    """
+    order, tags = _tiff_tags(content)
+    places = [place for tag, place in tags if tag == _TIFF_ORIENTATION]
+    if not places:
+        return content
+    changed = bytearray(content)
+    for place in places:
+        struct.pack_into(order + "HHIHH", changed, place, _TIFF_ORIENTATION, 3, 1, 1, 0)
+    return bytes(changed)
 
 
 def _webp(content: bytes) -> tuple[int, int] | None:
@@ -183,7 +211,6 @@ _FORMATS: tuple[tuple[bytes, Callable[[bytes], tuple[int, int] | None]], ...] = 
     (b"\x89PNG\r\n\x1a\n", _png),
     (b"BM", _bmp),
     (b"P", _pnm),
-    (b"II*\0", _tiff),
-    (b"MM\0*", _tiff),
+    *((start, _tiff) for start in _TIFF_STARTS),
     (b"RIFF", _webp),
 )

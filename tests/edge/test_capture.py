@@ -443,6 +443,9 @@ def test_a_failure_inside_opencv_is_an_unreadable_frame(monkeypatch, clip_dir):
         def get(self, name):
             return 0.0
 
+        def set(self, name, value):
+            return False
+
         def getBackendName(self):  # noqa: N802 - OpenCV's name
             return "FFMPEG"
 

@@ -49,8 +49,7 @@ def bomb(side=32000):
 
 def with_orientation(jpeg, orientation):
     """Add an EXIF segment that requests a rotation to the JPEG."""
-    tiff = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
-    data = b"Exif\0\0" + tiff
+    data = b"Exif\0\0" + exif(orientation)
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(data) + 2) + data + jpeg[2:]
 
 
@@ -128,11 +127,66 @@ def test_alpha_is_dropped_and_grey_repeated(suffix):
     np.testing.assert_array_equal(decode_image(content.tobytes()), np.dstack([grey] * 3))
 
 
+def exif(orientation):
+    return b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
+
+
+def turned_png(png, orientation):
+    """Add an eXIf chunk behind the header of a PNG."""
+    checked = b"eXIf" + exif(orientation)
+    length, checksum = struct.pack(">I", len(checked) - 4), struct.pack(">I", zlib.crc32(checked))
+    return png[:33] + length + checked + checksum + png[33:]
+
+
+def turned_webp(webp, orientation):
+    """Add an EXIF chunk behind the picture of a WebP of 64x48, which becomes an extended one."""
+    canvas = bytes([0x08, 0, 0, 0]) + (63).to_bytes(3, "little") + (47).to_bytes(3, "little")
+    data = exif(orientation)
+    chunks = b"VP8X" + struct.pack("<I", 10) + canvas + webp[12:]
+    chunks += b"EXIF" + struct.pack("<I", len(data)) + data + bytes(len(data) % 2)
+    return b"RIFF" + struct.pack("<I", 4 + len(chunks)) + b"WEBP" + chunks
+
+
+def turned_tiff(tiff, orientation, kind=3):
+    """Add tag 274 to a TIFF, in a copy of its tags at the end."""
+    (begin,) = struct.unpack_from("<I", tiff, 4)
+    (count,) = struct.unpack_from("<H", tiff, begin)
+    tags = [tiff[begin + 2 + 12 * n : begin + 14 + 12 * n] for n in range(count)]
+    tags = [tag for tag in tags if tag[:2] != struct.pack("<H", 274)]
+    tags.append(struct.pack("<HHII", 274, kind, 1, orientation))
+    listed = struct.pack("<H", len(tags)) + b"".join(sorted(tags, key=lambda tag: tag[1::-1]))
+    return tiff[:4] + struct.pack("<I", len(tiff)) + tiff[8:] + listed + bytes(4)
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_the_camera_s_own_pixel_order_is_kept(orientation):
-    content = encoded(".jpg", picture())
-    turned = with_orientation(content, orientation)
-    np.testing.assert_array_equal(decode_image(turned), decode_image(content))
+@pytest.mark.parametrize(
+    ("suffix", "turned"),
+    [
+        (".jpg", with_orientation),
+        (".png", turned_png),
+        (".webp", turned_webp),
+        (".tif", turned_tiff),
+    ],
+)
+def test_the_camera_s_own_pixel_order_is_kept(suffix, turned, orientation):
+    content = encoded(suffix, picture())
+    found = decode_image(turned(content, orientation))
+    np.testing.assert_array_equal(found, decode_image(content))
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_a_tiff_of_either_byte_order_and_any_type_of_the_tag_is_not_turned(order):
+    pixels = bytes(range(256))
+    tags = [(256, 3, 16), (257, 3, 16), (258, 3, 8), (259, 3, 1), (262, 3, 1), (273, 4, 8)]
+    tags += [(274, 4, 6), (277, 3, 1), (278, 3, 16), (279, 4, 256)]
+    entries = b"".join(
+        struct.pack(order + ("HHII" if kind == 4 else "HHIHxx"), tag, kind, 1, value)
+        for tag, kind, value in tags
+    )
+    start = (b"II" if order == "<" else b"MM") + struct.pack(order + "HI", 42, 8 + len(pixels))
+    content = start + pixels + struct.pack(order + "H", len(tags)) + entries + bytes(4)
+    expected = np.frombuffer(pixels, np.uint8).reshape(16, 16)
+    np.testing.assert_array_equal(decode_image(content)[:, :, 0], expected)
 
 
 NO_HEADER = (
@@ -205,6 +259,7 @@ def test_another_release_of_opencv_reads_the_same(tmp_path, clip_dir):
             contents.append(bytes(changed))
     contents += [encoded(suffix, wide) for suffix in (".png", ".tif", ".ppm")]
     contents += [with_orientation(contents[0], 6), contents[0] + bytes(100)]
+    contents += [turned_tiff(encoded(".tif", picture()), number) for number in (3, 6)]
     contents.append(encoded(".tif", picture().astype(np.float32)))
     contents.append(encoded(".png", np.dstack([picture(), picture()[:, :, :1]])))
     for number, content in enumerate(contents):

@@ -3,6 +3,7 @@
 import gc
 import os
 import re
+import struct
 import subprocess
 import sys
 import threading
@@ -359,6 +360,26 @@ def test_videos_of_other_containers_are_read(tmp_path, suffix, codec):
         writer.write(picture(value))
     writer.release()
     assert [frame.image.shape for frame in open_source(str(path))] == [(48, 64, 3)] * 3
+
+
+def test_a_video_with_a_rotation_tag_is_read_in_the_sensor_s_order(tmp_path):
+    path = tmp_path / "clip.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 20.0, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV does not write it")
+    for value in range(3):
+        writer.write(picture(value))
+    writer.release()
+    upright = [frame.image for frame in open_source(path)]
+    content = bytearray(path.read_bytes())
+    # The matrix of a track's header, in 16.16 and 2.30 fixed point: a quarter turn.
+    at = content.index(b"tkhd") + 44
+    content[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    # OpenCV alone turns it.
+    assert cv2.VideoCapture(str(path)).read()[1].shape == (64, 48, 3)
+    turned = [frame.image for frame in open_source(path)]
+    assert [(one == other).all() for one, other in zip(upright, turned, strict=True)] == [True] * 3
 
 
 def test_text_that_comes_through_a_pipe_is_refused(tmp_path):
