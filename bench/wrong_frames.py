@@ -36,11 +36,13 @@ Figures = dict[str, Any]
 def streams_of(rows: list[Rows], start: int, frames: int) -> Iterator[Rows]:
     """Choose streams, ``start`` right frames and then faulty ones, until there are enough.
 
-    Recordings come in an order drawn once, the same for all kinds.
+    Recordings come in an order drawn once, the same for all kinds; short ones make others longer.
     """
-    most = max(LEAST_OF_A_STREAM, -(-frames // len(rows)))
+    left = [max(0, len(recording) - start) for recording in rows]
+    lengths = range(LEAST_OF_A_STREAM, frames)
+    most = next((n for n in lengths if sum(min(n, each) for each in left) >= frames), frames)
     for recording in np.random.default_rng(0).permutation(len(rows)).tolist():
-        count = min(most, frames, len(rows[recording]) - start)
+        count = min(most, frames, left[recording])
         if count > 0:
             yield rows[recording][: start + count]
             frames -= count

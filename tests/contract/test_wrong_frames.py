@@ -1,0 +1,83 @@
+"""How wrong frames are chosen and counted, by hand-made estimates."""
+
+import sys
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
+
+import vigilance_tables
+from alarms import false_alarms
+from wrong_frames import shares, streams_of, summary
+
+
+@dataclass
+class Estimate:
+    bounded: bool
+    reasons: tuple = ()
+
+
+@dataclass
+class Seen:
+    finite: bool
+    misplaced: bool
+    reasons: tuple = ()
+
+    @property
+    def estimate(self):
+        return self
+
+
+@pytest.mark.parametrize("lengths", [[200], [50] * 12, [30, 7, 60, 45], [60] * 3])
+@pytest.mark.parametrize("start", [0, 10, 40])
+def test_streams_hold_the_frames_asked_for_after_their_right_ones(lengths, start):
+    borders = np.cumsum([0, *lengths])
+    rows = [np.arange(a, b) for a, b in pairwise(borders.tolist())]
+    streams = list(streams_of(rows, start, 100))
+    assert len({stream[0] for stream in streams}) == len(streams)
+    for stream in streams:
+        assert stream[0] in borders
+        assert len(stream) > start
+        np.testing.assert_array_equal(np.diff(stream), 1)
+    faulty = sum(len(stream) - start for stream in streams)
+    assert faulty == min(100, sum(max(0, length - start) for length in lengths))
+
+
+def test_shares_are_of_all_frames():
+    seen = [Seen(True, True), Seen(True, False), Seen(False, False, ("image_black",))] * 2
+    found = shares([*seen, Seen(False, False), Seen(False, False)])
+    assert found == {
+        "frames": 8,
+        "wrong": 0.25,
+        "finite": 0.5,
+        "reasons": {"image_black": 0.25},
+    }
+
+
+def test_unchanged_kinds_count_nowhere():
+    wrong = [(0.0, True), (0.12, True), (0.9, True), (1.0, False)]
+    found = summary({"wrong": share, "changed": changed} for share, changed in wrong)
+    assert found == {"kinds": 3, "median": 0.12, "over_0.10": 2, "over_0.15": 1, "worst": 0.9}
+
+
+def test_episodes_are_runs_and_end_with_a_stream():
+    doubt, right = Estimate(False, ("frame_repeated",)), Estimate(True)
+    found = false_alarms([[doubt, doubt, right, doubt], [doubt, right], [right, right]])
+    assert found == {
+        "frames": 8,
+        "streams": 3,
+        "doubted": 4,
+        "reasons": {"frame_repeated": 4},
+        "episodes": 3,
+        "longest_episode": 2,
+        "streams_with_doubts": 2,
+    }
+
+
+def test_tables_say_where_nothing_was_measured(monkeypatch):
+    monkeypatch.setattr(vigilance_tables, "result_files", lambda _: [])
+    assert {make() for make in vigilance_tables.TABLES.values()} == {vigilance_tables.NOTHING}
