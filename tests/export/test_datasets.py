@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from cvo_export.datasets.base import Intrinsics
 from cvo_export.datasets.describe import describe, summary
 from cvo_export.datasets.frames import FrameList
 from cvo_export.datasets.poses import quaternion_pose
+from cvo_export.datasets.sizes import image_sizes, one_size
 from cvo_export.datasets.tables import read_rows
 
 IDENTITY = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -64,6 +66,43 @@ def test_a_description_has_the_camera_and_each_sequence():
     told = describe(open_dataset("synthetic:room,flights=2,frames=3,size=64x48"))
     assert told[2] == "camera      fx 58.5, fy 58.5, cx 31.5, cy 23.5 px"
     assert told[4:] == ["sequence    flight-01: 3", "sequence    flight-02: 3"]
+
+
+def mixed(folder):
+    """Write a sequence of twelve frames, two of them of another size and one without a header."""
+    (folder / "rgb").mkdir(parents=True)
+    names = [f"rgb/{i}.{'jpg' if i % 2 else 'png'}" for i in range(12)]
+    rows = [f"{i}.0 {name}\n" for i, name in enumerate(names)]
+    (folder / "rgb.txt").write_text("".join(rows))
+    (folder / "groundtruth.txt").write_text("".join(f"{i} {i} 0 0 0 0 0 1\n" for i in range(12)))
+    for i, name in enumerate(names):
+        size = (36, 64, 3) if i in (4, 7) else (48, 64, 3)
+        cv2.imwrite(str(folder / name), np.full(size, 20 * i, np.uint8))
+    (folder / names[9]).write_bytes(b"\xff\xd8")
+    return folder
+
+
+def test_sizes_are_those_of_the_files_headers(tmp_path):
+    found = open_dataset(f"tum:{mixed(tmp_path / 'desk')}")
+    assert image_sizes(found) == {(64, 48): 9, (64, 36): 2}
+    assert describe(found)[1] == "image       64 x 48 px; of several sizes: 64x48 (9), 64x36 (2)"
+    whole = open_dataset("synthetic:room,flights=2,frames=3,size=64x48")
+    assert one_size(whole) == one_size(replace(whole, image_size=None)) == (64, 48)
+
+
+def test_images_of_several_sizes_are_refused(tmp_path):
+    data = f"tum:{mixed(tmp_path / 'desk')}"
+    (tmp_path / "m.onnx").touch()
+    expected = (
+        "cvo-export: desk: expected images of one size, found 64x48 (9), 64x36 (2); leave the "
+        "others out, or resize those of the same camera\n"
+    )
+    told = cvo_export("calibrate", str(tmp_path / "m.onnx"), data, str(tmp_path / "b"))
+    assert (told.returncode, told.stderr.splitlines(keepends=True)[-1]) == (6, expected)
+    told = cvo_export("train", data, str(tmp_path / "run"), "--method", "cjp", "--weights", "none")
+    assert (told.returncode, told.stderr.splitlines(keepends=True)[-1]) == (6, expected)
+    assert not (tmp_path / "b").exists()
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_camera_is_scaled_with_its_images():

@@ -65,6 +65,9 @@ class PoseDataset:
     read_image
         Maps a frame number to an image, shape (height, width, 3), uint8, BGR. Raises
         ``SourceError`` if the image cannot be read.
+    image_size
+        Maps a frame number to height and width of its image, from its header alone, or to None if
+        it has none; None if the data set cannot tell sizes.
     intrinsics
         The camera, or None if the data set does not state it.
     lens
@@ -83,6 +86,7 @@ class PoseDataset:
     sequence_names: tuple[str, ...]
     frame_names: tuple[str, ...]
     read_image: Callable[[int], NDArray[np.uint8]]
+    image_size: Callable[[int], tuple[int, int] | None] | None = None
     intrinsics: Intrinsics | None = None
     lens: Lens = NO_DISTORTION
     own_train: frozenset[int] = frozenset()

@@ -6,6 +6,7 @@ import numpy as np
 
 from cvo_edge.input.image_files import left_out_text
 from cvo_export.datasets.base import PoseDataset, skipped_text
+from cvo_export.datasets.sizes import image_sizes, sizes_text
 
 
 def summary(dataset: PoseDataset) -> str:
@@ -16,11 +17,13 @@ def summary(dataset: PoseDataset) -> str:
 
 
 def describe(dataset: PoseDataset) -> list[str]:
-    """Return the summary, image size, camera, extent of the positions and frames per sequence.
+    """Return the summary, image sizes, camera, extent of the positions and frames per sequence.
 
     Raises SourceError if the first image cannot be read.
     """
     height, width = dataset.read_image(0).shape[:2]
+    sizes = image_sizes(dataset)
+    mixed = f"; of several sizes: {sizes_text(sizes)}" if len(sizes) > 1 else ""
     camera = "not stated"
     if dataset.intrinsics is not None:
         numbers = dataset.intrinsics._asdict()
@@ -34,7 +37,7 @@ def describe(dataset: PoseDataset) -> list[str]:
     return [
         summary(dataset),
         *([f"left out    {left_out_text(dataset.left_out)}"] if dataset.left_out else []),
-        f"image       {width} x {height} px",
+        f"image       {width} x {height} px{mixed}",
         f"camera      {camera}",
         "positions   " + ", ".join(f"{axis} {a:.2f} .. {b:.2f}" for axis, a, b in extent) + " m",
         *(

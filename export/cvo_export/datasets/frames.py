@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.input.decoding import decode_image
+from cvo_edge.input.decoding import decode_image, image_size
 from cvo_edge.input.image_files import frame_name, images_in
 from cvo_export.datasets.base import PoseDataset, skipped_text
 
 Array = NDArray[np.float64]
+
+# Bytes that hold the header of most images, but not of a JPEG, which must be whole.
+_HEADER = 4096
 
 
 class FrameList:
@@ -85,6 +89,7 @@ class FrameList:
             sequence_names=tuple(self._sequence_names),
             frame_names=tuple(self._frame_names),
             read_image=image_reader(self._images),
+            image_size=partial(_size_of, tuple(self._images)),
             skipped=dict(self._skipped),
             left_out=dict(self._left_out),
         )
@@ -106,3 +111,13 @@ def image_reader(paths: Sequence[Path]) -> Callable[[int], NDArray[np.uint8]]:
         return image
 
     return read_image
+
+
+def _size_of(paths: Sequence[Path], index: int) -> tuple[int, int] | None:
+    """Return height and width in the header of an image file, or None."""
+    try:
+        with paths[index].open("rb") as stream:
+            start = stream.read(_HEADER)
+            return image_size(start) or image_size(start + stream.read())
+    except OSError:
+        return None

@@ -72,6 +72,7 @@ def open_room(spec: str = "room") -> PoseDataset:
         sequence_names=names,
         frame_names=tuple(f"{name}/frame-{j:06d}" for name in names for j in range(options.frames)),
         read_image=read_image,
+        image_size=lambda _: (options.height, options.width),
         intrinsics=intrinsics,
     )
 

@@ -17,6 +17,7 @@ from cvo_edge.vocabulary import Crop, SplitKind
 from cvo_export.data.augment import AugmentConfig
 from cvo_export.data.splits import Split, make_split, read_split_spec, same_split
 from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.datasets.sizes import one_size
 from cvo_export.networks.backbone import NO_WEIGHTS, Backbone, BackboneConfig, load_weights
 from cvo_export.networks.heads import ExportedHead, Setting
 from cvo_export.networks.methods import TRAINABLE, options_of
@@ -192,7 +193,8 @@ def loaded_backbone(
 def open_run(run_dir: Path, config: TrainConfig) -> tuple[PoseDataset, Split]:
     """Open the data set of a configuration and split it; writes nothing.
 
-    Raises UsageError if the folder belongs to another configuration.
+    Raises UsageError if the folder belongs to another configuration, SourceError if the images have
+    several sizes.
     """
     path = run_dir / CONFIG_FILE
     if run_dir.exists() and not run_dir.is_dir():
@@ -203,6 +205,7 @@ def open_run(run_dir: Path, config: TrainConfig) -> tuple[PoseDataset, Split]:
             "choose another folder"
         )
     dataset = open_dataset(config.dataset)
+    one_size(dataset)
     return dataset, make_split(dataset, config.split, config.seed)
 
 

@@ -1,0 +1,43 @@
+"""The image sizes of a data set: a bundle is made for images of one size."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from cvo_edge.errors import SourceError
+from cvo_export.datasets.base import PoseDataset
+
+Size = tuple[int, int]
+
+
+def image_sizes(dataset: PoseDataset) -> Counter[Size]:
+    """Count the frames of each image size (width, height), without unreadable images.
+
+    Reads the files' headers. A data set that cannot tell sizes is taken to have that of its first
+    image, for which SourceError is raised if it cannot be read.
+    """
+    if dataset.image_size is None:
+        height, width = dataset.read_image(0).shape[:2]
+        return Counter({(width, height): len(dataset)})
+    found = (dataset.image_size(index) for index in range(len(dataset)))
+    return Counter((size[1], size[0]) for size in found if size is not None)
+
+
+def one_size(dataset: PoseDataset) -> Size:
+    """Return width and height of all images of a data set.
+
+    Raises SourceError if they have several sizes, or if no image can be read.
+    """
+    sizes = image_sizes(dataset)
+    if len(sizes) != 1:
+        raise SourceError(
+            f"{dataset.name}: expected images of one size, found {sizes_text(sizes) or 'none'}"
+            + ("; leave the others out, or resize those of the same camera" if sizes else "")
+        )
+    (size,) = sizes
+    return size
+
+
+def sizes_text(sizes: Counter[Size]) -> str:
+    """Return the sizes and the number of frames of each, the most frequent first."""
+    return ", ".join(f"{w}x{h} ({count})" for (w, h), count in sizes.most_common())
