@@ -33,21 +33,6 @@ CONFIDENCE = 0.9
 RULES: tuple[Rule, ...] = get_args(Rule)
 
 
-def part(seen: Observed, rows: NDArray[np.bool_]) -> Observed:
-    """Return the chosen rows of observations."""
-    return Observed(
-        indices=seen.indices[rows],
-        outputs={name: values[rows] for name, values in seen.outputs.items()},
-        point=seen.point[rows],
-        truth=seen.truth[rows],
-        pose=seen.pose[rows],
-        true_pose=seen.true_pose[rows],
-        sequence=seen.sequence[rows],
-        invalid=0,
-        degraded=0,
-    )
-
-
 def deal_figures(
     head: Head, cal: Scored, test: Observed, val: Scored, rule: Rule, unit: Array
 ) -> dict[str, Array]:
@@ -96,7 +81,7 @@ def main() -> None:
     collected: dict[tuple[str, str], list[Array]] = {}
     for _ in range(arguments.deals):
         drawn = np.isin(seen.sequence, generator.permutation(recordings)[:count])
-        cal, test = part(seen, drawn).scored(head), part(seen, ~drawn)
+        cal, test = seen.where(drawn).scored(head), seen.where(~drawn)
         for rule in RULES:
             for scope, values in deal_figures(head, cal, test, val, rule, unit).items():
                 collected.setdefault((rule, scope), []).append(values)

@@ -7,6 +7,7 @@ given by its normalised coordinates (x/z, y/z).
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -39,6 +40,10 @@ _CONVERGED = 1e-9
 _ALONG = 33
 # Smallest side of an image, largest camera file.
 LEAST_SIDE, _LARGEST_FILE = 16, 64 * 1024
+# A camera in one word, as ``--camera`` takes it.
+_SHORT = re.compile(
+    r"(?P<width>\d+)x(?P<height>\d+),(?P<fx>[^,]+),(?P<fy>[^,]+),(?P<cx>[^,]+),(?P<cy>[^,]+)"
+)
 # Wider pinhole images exist in files with a mistake only.
 _WIDEST_DEG = 170.0
 
@@ -165,8 +170,20 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit
         return found, jacobian.reshape(*rays.shape, 2)
 
 
-def read_camera(path: Path) -> Camera:
-    """Read a camera from a JSON file with the fields of ``Camera``; raises UsageError."""
+def read_camera(given: str | Path) -> Camera:
+    """Read a camera from a JSON file with the fields of ``Camera``, or from a short text.
+
+    The text is ``WIDTHxHEIGHT,FX,FY,CX,CY``. Raises UsageError.
+    """
+    path = Path(given)
+    short = _SHORT.fullmatch(str(given))
+    if short is not None and not path.exists():
+        try:
+            return msgspec.convert(short.groupdict(), Camera, strict=False)
+        except msgspec.ValidationError as error:
+            raise UsageError(
+                f"camera: expected WIDTHxHEIGHT,FX,FY,CX,CY in pixels, found {given}: {error}"
+            ) from None
     content = read_regular_file(path, _LARGEST_FILE, UsageError, links=True)
     try:
         return msgspec.json.decode(content, type=Camera)

@@ -46,7 +46,9 @@ class Reason(StrEnum):
     IMAGE_SATURATED = "image_saturated"  # degraded: more than half of the image is white
     IMAGE_FLAT = "image_flat"  # degraded: one colour, no contrast
     IMAGE_SIZE_CHANGED = "image_size_changed"  # degraded: not the size of the stream's first frame
-    CAMERA_DIFFERS = "camera_differs"  # degraded: the images are not those of the stated camera
+    CAMERA_DIFFERS = "camera_differs"  # degraded: the images are not those of the known camera
+    IMAGE_TOO_SMALL = "image_too_small"  # degraded: fewer pixels than calibration images and model
+    IMAGE_GREY = "image_grey"  # degraded: no colour, unlike the calibration images
     IMAGE_UNFAMILIAR = "image_unfamiliar"  # degraded: does not show the place the network knows
     FRAME_REPEATED = "frame_repeated"  # degraded: the same image came before; it may be frozen
     FRAME_STALE = "frame_stale"  # degraded: the frame waited for more than a second
@@ -55,6 +57,7 @@ class Reason(StrEnum):
         "bounds_crossed"  # ok: a negative correction emptied a set; it is now its midpoint
     )
     PITCH_NEAR_90 = "pitch_near_90"  # ok: |pitch| > 80 deg, roll and yaw are ill-defined
+    IMAGE_RESIZED = "image_resized"  # ok: another size than the calibration images; told once
 
 
 class _Strict(Struct, frozen=True, forbid_unknown_fields=True):

@@ -72,14 +72,14 @@ class Odometer:
         ``marginal``: the confidence holds for each degree of freedom; ``joint``: for all six at
         once.
     camera
-        The camera that takes the images, if it is not the bundle's own; only methods that solve
-        for the pose use it.
+        The camera that takes the images, if it is not the bundle's own. For methods that do not
+        solve for the pose, its images must show all that those of the bundle's camera show.
 
     Raises
     ------
     UsageError
-        A confidence that is not stored, an unknown scope or mode, or a camera given to a method
-        that does not use it.
+        A confidence that is not stored, an unknown scope or mode, or a camera whose images cannot
+        be brought to the view of the bundle's own.
     ModelError, BundleMismatchError
         The engine refuses the model.
     """
@@ -105,11 +105,6 @@ class Odometer:
         self._workers = settings.workers
         self.threads = settings.threads * settings.workers
         camera = None if camera is None else checked_camera(camera)
-        if camera is not None and not bundle.head.solves:
-            raise UsageError(
-                f"camera: expected a method that solves for the pose, found {calibration.method}, "
-                "whose network learned one camera; omit it"
-            )
         self._observer = Observer(
             bundle.model,
             calibration.model,
@@ -118,6 +113,7 @@ class Odometer:
             bundle.head,
             calibration.camera,
             camera,
+            calibration.images,
             threads=settings.threads,
             spinning=settings.spinning,
             at_once=settings.workers,
@@ -125,6 +121,7 @@ class Odometer:
         self.chart = self._observer.chart
         self.origin_m = self._observer.origin_m
         self._stream_checks = StreamChecks()
+        self._sizes = self._observer.stream_sizes()
         self._camera_check = self._observer.camera_check()
         self._clock = SYSTEM_CLOCK
         self._stepping = Lock()
@@ -267,6 +264,7 @@ class Odometer:
                 "odometer.stream(open_source(path))"
             )
         self._stream_checks = StreamChecks()
+        self._sizes = self._observer.stream_sizes()
         self._camera_check = self._observer.camera_check()
         with closing(
             run_stream(
@@ -299,6 +297,7 @@ class Odometer:
         doubts = tuple(reason for reason in (observation.doubt, fault) if reason is not None)
         # The age counts until the estimate is given: a process may be stopped at any point.
         age_ms = frame.age_ms(self._clock.now_s())
+        doubts += self._sizes.doubts(observation.look)
         doubts += self._stream_checks.doubts(observation.look, frame.stamp_ns, age_ms)
         if self._camera_differs(observation, doubts):
             doubts += (Reason.CAMERA_DIFFERS,)
@@ -348,7 +347,7 @@ class Odometer:
             remarks += (Reason.BOUNDS_CROSSED,)
         if self.chart.rotation == "euler_zyx" and abs(observation.point[4]) > _STEEP_PITCH:
             remarks += (Reason.PITCH_NEAR_90,)
-        return remarks
+        return remarks + self._sizes.remarks(observation.look)
 
     def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
         """Run the network on one image without applying a threshold; see ``Observer.observe``.

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import msgspec
 from msgspec import Meta, Struct
 
-from cvo_edge.camera import Camera
+from cvo_edge.camera import LEAST_SIDE, Camera
 from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.pose import Rotation
 from cvo_edge.vocabulary import Crop, Joint, Precision, Provider, Rule, Scope, SplitKind
@@ -187,11 +187,23 @@ class Provenance(_Strict, frozen=True):
     options: dict[Text, Text | int | float | bool | None]
 
 
+class ImageSpec(_Strict, frozen=True):
+    """The calibration images, as they were before preprocessing.
+
+    ``width``, ``height``: their size in pixels. ``colour``: whether they have colour, but for a few
+    that count as flagged; images without it are then doubted.
+    """
+
+    width: Annotated[int, Meta(ge=LEAST_SIDE, le=100_000)]
+    height: Annotated[int, Meta(ge=LEAST_SIDE, le=100_000)]
+    colour: bool
+
+
 class Calibration(_Strict, frozen=True, omit_defaults=True):
     """The contents of ``calibration.json``, version 1.
 
     ``camera``: intrinsics of the calibration images' camera; null if the data set does not state
-    them.
+    them. ``images``: their size and colour; null in bundles of earlier releases.
     """
 
     schema_version: Literal[1]
@@ -207,6 +219,7 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
     provenance: Provenance
     digest: Sha256
     camera: Camera | None = None
+    images: ImageSpec | None = None
 
     def threshold(self, confidence: float, scope: Scope) -> Threshold | None:
         """Return the stored threshold for this confidence and scope, or None.

@@ -39,6 +39,7 @@ def check_rules(calibration: Calibration) -> None:
             )
     _check_thresholds(calibration.thresholds)
     _check_model(calibration)
+    _check_images(calibration)
 
 
 def _check_thresholds(thresholds: tuple[Threshold, ...]) -> None:
@@ -105,4 +106,15 @@ def _check_model(calibration: Calibration) -> None:
         raise CalibrationFileError(
             f"selftest.outputs: expected one value per element of model.outputs {shown(sizes)}, "
             f"found {shown(given)}"
+        )
+
+
+def _check_images(calibration: Calibration) -> None:
+    images, camera = calibration.images, calibration.camera
+    if images is None or camera is None:
+        return
+    if (images.width, images.height) != (camera.width, camera.height):
+        raise CalibrationFileError(
+            f"images: expected the size of camera, {camera.width}x{camera.height}, found "
+            f"{images.width}x{images.height}"
         )

@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import MAX_NUMBER, ModelSpec, PoseSpec, PreprocessSpec
+from cvo_edge.bundle.format import MAX_NUMBER, ImageSpec, ModelSpec, PoseSpec, PreprocessSpec
 from cvo_edge.camera import Camera
 from cvo_edge.camera_check import CameraCheck
 from cvo_edge.engine.loading import open_session
@@ -26,11 +26,14 @@ from cvo_edge.estimate import Reason
 from cvo_edge.heads import Head
 from cvo_edge.input import preprocess
 from cvo_edge.input.frame_checks import Look, image_doubt
-from cvo_edge.input.view import View, crop_view, matched_view, seen_camera
+from cvo_edge.input.image_checks import ROUNDING_PX, KnownImages, StreamSizes
+from cvo_edge.input.view import View, check_same_view, crop_view, matched_view, seen_camera
 from cvo_edge.pose import Chart
 
 Array = NDArray[np.float64]
 
+# A solver uses the shape of its camera's images exactly, as far as sizes are whole pixels.
+_SOLVER_ROUNDING_PX = 0.5
 # Up to this size, a plain Python loop is faster than the first numpy call.
 _FEW = 64
 _NO_POSE = np.full(7, np.nan)
@@ -81,6 +84,8 @@ class Observer:
         The camera of the images that the network has learned; None if its intrinsics are unknown.
     camera
         The camera that takes the images, by default the learned one.
+    images
+        The images of the calibration; None if they are unknown.
     threads
         Threads of one inference; all allowed cores by default.
     spinning
@@ -92,6 +97,8 @@ class Observer:
     ------
     ModelError, BundleMismatchError
         The engine refuses the model, or the model does not match ``spec``.
+    UsageError
+        The images of ``camera`` cannot be brought to the view that the network has learned.
     """
 
     def __init__(
@@ -103,6 +110,7 @@ class Observer:
         head: Head,
         learned: Camera | None = None,
         camera: Camera | None = None,
+        images: ImageSpec | None = None,
         *,
         threads: int | None = None,
         spinning: bool = True,
@@ -120,7 +128,17 @@ class Observer:
             own = crop_view(learned.height, learned.width, *shape).camera(learned)
             self._cameras = camera or learned, own
             self._seen = seen_camera(*self._cameras, inputs.crop)
+            if camera is not None and not head.solves:
+                check_same_view(camera, learned, own, inputs.crop)
+        elif camera is not None:
+            raise UsageError(
+                "camera: expected a bundle that states the intrinsics of its own camera, found "
+                "none; omit it, and give images of that camera"
+            )
         self._solver = head.solver(self._seen)
+        # The view is found by the cameras, not by the image's shape alone.
+        self._matched = self._cameras is not None and (head.solves or camera is not None)
+        self._known = self._known_images(camera, images)
         reference = None if pose.reference_q_xyzw is None else np.array(pose.reference_q_xyzw)
         absolute = pose.rotation == "tangent_reference"
         self.chart = Chart(pose.rotation, reference if absolute else None)
@@ -175,9 +193,12 @@ class Observer:
         if image is None:
             return _faulty(Reason.IMAGE_UNSUPPORTED)
         height, width = image.shape[0], image.shape[1]
-        tensor = preprocess.viewed(image, self._view(height, width))[np.newaxis]
+        view = self._view(height, width)
+        tensor = preprocess.viewed(image, view)[np.newaxis]
         look = Look(tensor, (height, width))
-        doubt = image_doubt(look) or self._shape_doubt(height, width)
+        doubt = image_doubt(look)
+        if doubt is None and self._known is not None:
+            doubt = self._known.doubt(look, view.enlarged)
         ready = perf_counter()
         outputs: Mapping[str, NDArray[Any]]
         outputs = session.run({"image": tensor, **self._head.extra_inputs(seq)})
@@ -198,21 +219,29 @@ class Observer:
         """Return a check of the camera for a new stream, or None if the method has none."""
         return self._head.camera_check(self._seen)
 
+    def stream_sizes(self) -> StreamSizes:
+        """Return a check of the sizes of the images of a new stream."""
+        return StreamSizes(None if self._known is None else self._known.size)
+
     def _view(self, height: int, width: int) -> View:
         """Return the view of an image, which need not have the size that its camera states."""
-        if self._solver is None or self._cameras is None:
+        if not self._matched or self._cameras is None:
             inputs = self._inputs
             return crop_view(height, width, inputs.height, inputs.width, inputs.crop)
         camera, own = self._cameras
         return matched_view(camera.scaled(width, height), own, self._inputs.crop)
 
-    def _shape_doubt(self, height: int, width: int) -> Reason | None:
-        """Doubt images of another shape than the camera's; only a solver depends on it."""
-        if self._solver is None or self._cameras is None:
+    def _known_images(self, camera: Camera | None, images: ImageSpec | None) -> KnownImages | None:
+        """Return the images to expect: those of the camera, or else those of the calibration."""
+        rounding_px, sized = ROUNDING_PX, camera or images
+        if self._head.solves:
+            rounding_px = _SOLVER_ROUNDING_PX
+            sized = self._cameras and self._cameras[0]
+        if sized is None:
             return None
-        camera, _ = self._cameras
-        similar_shape = similar((height, width), (camera.height, camera.width))
-        return None if similar_shape else Reason.CAMERA_DIFFERS
+        size = sized.height, sized.width
+        colour = images is not None and images.colour
+        return KnownImages(size, colour, max(1.0, self._view(*size).enlarged), rounding_px)
 
     def _checked(
         self, outputs: Mapping[str, NDArray[Any]], fault: Reason | None
@@ -240,12 +269,6 @@ class Observer:
             )
         )
         return pose, point, fault if inside else Reason.POSE_IMPLAUSIBLE
-
-
-def similar(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether images of two sizes (height, width) have the same shape, to half a pixel."""
-    slack = 0.5 * max(*size, *other)
-    return abs(size[0] * other[1] - size[1] * other[0]) <= slack
 
 
 def _output_fault(outputs: Mapping[str, NDArray[Any]]) -> Reason | None:

@@ -63,23 +63,18 @@ class StreamChecks:
     def __init__(self) -> None:
         self._before: Look | None = None
         self._keys: deque[bytes] = deque(maxlen=_BUFFERS)
-        self._size: tuple[int, int] | None = None
         self._stamp_ns: int | None = None
 
     def doubts(self, look: Look | None, stamp_ns: int | None, age_ms: float) -> tuple[Reason, ...]:
         """Compare a frame with earlier ones and store it; ``look`` is None for an invalid image.
 
         Sensor noise never repeats, so an identical model input means a frozen image, a copy made by
-        an encoder, or a reused driver buffer. A size that differs from the first frame's means
-        another camera or another setting.
+        an encoder, or a reused driver buffer.
         """
         doubts: tuple[Reason, ...] = ()
         if look is not None:
             if self._seen(look):
                 doubts += (Reason.FRAME_REPEATED,)
-            self._size = self._size or look.size
-            if look.size != self._size:
-                doubts += (Reason.IMAGE_SIZE_CHANGED,)
             self._before = look
             self._keys.append(look.key)
         if stamp_ns is not None:

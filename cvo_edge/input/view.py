@@ -47,6 +47,13 @@ class View(NamedTuple):
     height: int
     width: int
 
+    @property
+    def enlarged(self) -> float:
+        """Pixels of the input per pixel of the image along a side, the larger of both sides."""
+        return max(
+            place / part for place, part in zip(self.place.shape, self.part.shape, strict=True)
+        )
+
     def camera(self, camera: Camera) -> Camera:
         """Return the camera whose images are the inputs, given the one that takes the images."""
         height, width = self.place.shape
@@ -132,6 +139,27 @@ def seen_camera(camera: Camera, learned: Camera, crop: Crop) -> SeenCamera:
     seen = view.camera(camera)
     whole = view.place.shape == (learned.height, learned.width)
     return SeenCamera(seen, view.place, whole and _same_rays(seen, learned))
+
+
+def check_same_view(camera: Camera, own: Camera, learned: Camera, crop: Crop) -> None:
+    """Raise UsageError if a camera's images cannot be cut and resized to those of another one.
+
+    A network that regresses the pose has learned one view: all of its input, to a hundredth of its
+    width, and as sharp. ``own`` is the camera of its calibration, ``learned`` that of its inputs.
+    """
+    view = matched_view(camera, learned, crop)
+    most = max(1.0, matched_view(own, learned, crop).enlarged)
+    if seen_camera(camera, learned, crop).learned and view.enlarged <= (1.0 + _SAME) * most:
+        return
+    expected, found = (
+        f"{each.width}x{each.height} with fx {each.fx:g}, fy {each.fy:g}, cx {each.cx:g}, "
+        f"cy {each.cy:g}" + (f", {each.distortion}" if each.coefficients else "")
+        for each in (own, camera)
+    )
+    raise UsageError(
+        f"camera: expected one whose images can be cut and resized to those of the bundle's "
+        f"camera, {expected}, without enlarging them, found {found}"
+    )
 
 
 def _shown(cells: int, pixels: int, first: int, last: int) -> NDArray[np.bool_]:

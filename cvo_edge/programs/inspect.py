@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from cvo_edge.bundle.format import Calibration, CalibrationSpec, Position
+from cvo_edge.bundle.format import Calibration, CalibrationSpec, ImageSpec, Position
 from cvo_edge.camera import Camera
 from cvo_edge.conformal import least_draws
 from cvo_edge.engine.model_cache import ModelCache
@@ -42,6 +42,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
             f"{source.split.kind} (seed {source.split.seed}), {source.rule}{_worth(source)}",
         ),
         *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
+        *([] if calibration.images is None else _entry("images", _images(calibration.images))),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
         *_entry("backbone", calibration.provenance.backbone or "a network supplied as ONNX"),
         "",
@@ -59,6 +60,10 @@ def inspect_lines(calibration: Calibration) -> list[str]:
 
 def _position(position_m: Position) -> str:
     return " ".join(f"{value:.10g}" for value in position_m) + " m in the world"
+
+
+def _images(images: ImageSpec) -> str:
+    return f"{images.width}x{images.height}, " + ("colour" if images.colour else "grey or mixed")
 
 
 def _camera(camera: Camera) -> str:

@@ -47,7 +47,7 @@ CameraOption = Annotated[
     Path | None,
     typer.Option(
         "--camera",
-        help="JSON file with width, height, fx, fy, cx, cy of another camera (scr, fused).",
+        help="Another camera: WIDTHxHEIGHT,FX,FY,CX,CY, or a JSON file with these fields.",
         readable=False,
         show_default=False,
         rich_help_panel="Input",

@@ -24,6 +24,7 @@ from cvo_edge.bundle.format import (
     Provenance,
     TensorSpec,
 )
+from cvo_edge.camera import Camera
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageError
 from cvo_edge.geometry import mean_rotation
@@ -48,6 +49,7 @@ from cvo_export.bundles.thresholds import calibrated, selected
 from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.data.splits import Split, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
+from cvo_export.datasets.sizes import Size, one_size
 from cvo_export.vocabulary import GivenRotation
 
 Array = NDArray[np.float64]
@@ -95,12 +97,13 @@ def calibrate(
     CalibrationFileError
         The folder is not a bundle.
     SourceError, UsageError
-        The data set is too small, its frames do not pass the checks or may have been used for
-        training, or an option does not apply.
+        The data set is too small, its images have several sizes, its frames do not pass the checks
+        or may have been used for training, or an option does not apply.
     SinkError
         The new folder cannot be written.
     """
     check_target(bundle_dir)
+    size = one_size(dataset)
     if model.is_dir():
         if rotation is not None or crop is not None:
             raise UsageError(
@@ -133,7 +136,7 @@ def calibrate(
         joint=joint,
         split=split.spec(dataset),
         dataset=dataset.name,
-        camera=draft.camera if solves else dataset.camera() or draft.camera,
+        camera=draft.camera if solves else dataset.camera() or _of_size(draft.camera, size),
         running=dataset.camera() if solves else None,
         model=msgspec.structs.replace(draft.model, provider=own),
         provenance=msgspec.structs.replace(draft.provenance, created_with=made),
@@ -141,6 +144,12 @@ def calibrate(
     chosen_from = selected(candidates, score, sides)
     calibration = calibrated(draft, model_bytes, dataset, split.roles, chosen_from)
     return write_bundle(bundle_dir, calibration, model_bytes)
+
+
+def _of_size(camera: Camera | None, size: Size) -> Camera | None:
+    """Return the camera, unless the images of the new data have another size than its own."""
+    same = camera is not None and (camera.width, camera.height) == size
+    return camera if same else None
 
 
 def _split_of(

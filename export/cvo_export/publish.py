@@ -28,6 +28,7 @@ from cvo_export.bundles.draft import (
 )
 from cvo_export.bundles.thresholds import calibrated, selected
 from cvo_export.bundles.writing import check_target, write_bundle
+from cvo_export.datasets.sizes import one_size
 from cvo_export.graph.quantise import quantised
 from cvo_export.graph.to_onnx import OPSET, check_parity, export_onnx
 from cvo_export.training.run import Run
@@ -66,10 +67,13 @@ def publish(
         The folder cannot be written, or contains files that do not belong to a bundle.
     UsageError
         The method does not have the requested score or sides.
+    SourceError
+        The images of the data set have several sizes.
     ModelError
         The provider is not installed, or cannot run the graph.
     """
     check_target(bundle_dir)
+    one_size(run.dataset)
     candidates = selected(run.graph.head.candidates(), score, sides)
     if rule is None:
         rule = "hierarchical" if run.split.kind == "sequence" else "pooled"

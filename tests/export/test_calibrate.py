@@ -1,5 +1,6 @@
 """Calibration of existing networks: an ONNX file or the model of a bundle."""
 
+import dataclasses
 import subprocess
 import sys
 
@@ -8,6 +9,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from cvo_edge import Odometer
+from cvo_edge.bundle.format import ImageSpec
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.conformal import conformal_quantile
 from cvo_edge.engine.loading import read_bundle
@@ -89,6 +91,39 @@ def test_a_point_network_gets_order_statistics_of_its_residuals(model_file, data
     level = find_level(evaluate(tmp_path / "b", dataset, "test")["levels"], 0.9, "marginal")
     low, high = level["coverage_band"]
     assert all(low <= share <= high for share in level["coverage"])
+
+
+@pytest.mark.parametrize(("every", "colour"), [(40, True), (4, False)])
+def test_a_few_grey_frames_are_not_calibrated_with(model_file, dataset, tmp_path, every, colour):
+    def read_image(index):
+        image = dataset.read_image(index)
+        return image[:, :, 1] if index % every == 0 else image
+
+    some = dataclasses.replace(dataset, read_image=read_image)
+    calibration = calibrate(model_file, some, tmp_path / "b", "own", kind="random")
+    assert calibration.images == ImageSpec(width=64, height=48, colour=colour)
+    roles = same_split(dataset, calibration.calibration.split).roles
+    grey = {role: np.count_nonzero(indices % every == 0) for role, indices in roles.items()}
+    assert min(grey["cal"], grey["test"]) > 0
+    # The frames that the runtime doubts are those that were left out, and no others.
+    left_out = colour * grey["cal"]
+    assert calibration.calibration.n == roles["cal"].size - left_out
+    frames = evaluate(tmp_path / "b", some, "test")["frames"]
+    assert (frames["degraded"], frames["invalid"]) == (colour * grey["test"], 0)
+
+
+def test_a_camera_of_another_size_than_the_new_images_is_not_kept(model_file, tmp_path):
+    small = open_dataset("synthetic:room,flights=1,frames=12,size=64x48")
+    first = calibrate(model_file, small, tmp_path / "a", "a", kind="random")
+    assert (first.camera.width, first.images.width) == (64, 64)
+    for width, kept in ((64, first.camera), (80, None)):
+        new = open_dataset(f"synthetic:room,flights=1,frames=12,seed=1,size={width}x60")
+        new = dataclasses.replace(new, intrinsics=None)
+        if width == 64:
+            new = dataclasses.replace(small, intrinsics=None)
+        again = calibrate(tmp_path / "a", new, tmp_path / "b", "b", kind="random")
+        assert again.camera == kept
+        assert again.images.width == width
 
 
 @pytest.mark.parametrize("rotation", ["tangent_predicted", "euler_zyx"])

@@ -18,6 +18,7 @@ from cvo_edge.bundle.format import (
     MODEL_FILE,
     Calibration,
     CalibrationSpec,
+    ImageSpec,
     ModelSpec,
     PoseLimits,
     PoseSpec,
@@ -87,6 +88,8 @@ class Draft:
         How to compute the thresholds, and from which frames.
     running
         The camera of the calibration images, if it is not ``camera``.
+    images
+        Their size and colour; None before they have been read.
     """
 
     name: str
@@ -101,6 +104,7 @@ class Draft:
     split: SplitSpec
     dataset: str
     running: Camera | None = None
+    images: ImageSpec | None = None
 
     @classmethod
     def of(cls, calibration: Calibration) -> Draft:
@@ -135,7 +139,8 @@ class Draft:
         ``stated``: for images of the camera that the bundle states, instead of the running one.
         """
         cameras = self.camera, None if stated else self.running
-        return Observer(model_bytes, self.model, self.preprocess, self.pose, head, *cameras)
+        spec = self.model, self.preprocess, self.pose
+        return Observer(model_bytes, *spec, head, *cameras, self.images)
 
     def calibrated(
         self,
@@ -177,6 +182,7 @@ class Draft:
             ),
             provenance=self.provenance,
             camera=self.camera,
+            images=self.images,
             digest=UNWRITTEN,
         )
 

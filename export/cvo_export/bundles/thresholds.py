@@ -6,6 +6,7 @@ Coverage then does not depend on the fidelity of the export: the graph that runs
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,14 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import CONFIDENCES, Calibration, PoseSpec, SixOrUnbounded, Threshold
+from cvo_edge.bundle.format import (
+    CONFIDENCES,
+    Calibration,
+    ImageSpec,
+    PoseSpec,
+    SixOrUnbounded,
+    Threshold,
+)
 from cvo_edge.conformal import (
     conformal_quantile,
     effective_sample_size,
@@ -25,6 +33,7 @@ from cvo_edge.conformal import (
 from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.heads import Candidate, Head
+from cvo_edge.input.image_checks import has_colour
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import about
 from cvo_edge.programs.selftest import observe_selftest
@@ -36,6 +45,8 @@ from cvo_export.datasets import PoseDataset
 Array = NDArray[np.float64]
 
 
+# Share of images with colour from which those without it are doubted, and not calibrated with.
+_COLOURED = 0.95
 # Margin by which another score must win on val; smaller differences may be chance.
 _CLEARLY = 0.05
 
@@ -54,8 +65,9 @@ class Observed:
 
     ``outputs`` (n, ...) are the network's outputs by name; ``point`` and ``truth`` (n, 6) are in
     the bundle's chart; ``pose`` and ``true_pose`` are (n, 7); all positions are relative to the
-    bundle's origin. ``sequence`` (n,) holds sequence numbers; ``invalid`` and ``degraded`` count
-    the frames that the checks excluded.
+    bundle's origin. ``sequence`` (n,) holds sequence numbers; ``coloured`` (n,) tells which images
+    have colour; ``size`` is width and height of the first image; ``invalid`` and ``degraded``
+    count the frames that the checks excluded.
     """
 
     indices: NDArray[np.int64]
@@ -65,8 +77,19 @@ class Observed:
     pose: Array
     true_pose: Array
     sequence: NDArray[np.int64]
+    coloured: NDArray[np.bool_]
+    size: tuple[int, int]
     invalid: int
     degraded: int
+
+    def where(self, rows: NDArray[np.bool_]) -> Observed:
+        """Return the frames that a mask (n,) chooses; counts of excluded frames stay."""
+        chosen = {
+            name: getattr(self, name)[rows]
+            for name in ("indices", "point", "truth", "pose", "true_pose", "sequence", "coloured")
+        }
+        outputs = {name: values[rows] for name, values in self.outputs.items()}
+        return dataclasses.replace(self, outputs=outputs, **chosen)
 
     def scored(self, head: Head) -> Scored:
         """Return the scores of the true poses."""
@@ -119,6 +142,7 @@ def observe(
             f"{len(indices)}: {found}"
         )
     pose = np.array([observation.pose for observation in seen])
+    looks = [observation.look for observation in seen if observation.look is not None]
     true_pose = about(dataset.poses[kept], observer.origin_m)
     return Observed(
         indices=np.array(kept),
@@ -131,6 +155,8 @@ def observe(
         pose=pose,
         true_pose=true_pose,
         sequence=dataset.sequence[kept],
+        coloured=np.array([has_colour(look) for look in looks]),
+        size=(looks[0].size[1], looks[0].size[0]),
         invalid=invalid,
         degraded=degraded,
     )
@@ -166,6 +192,9 @@ def calibrated(
     with draft.observer(model_bytes, first) as observer:
         val = observe(observer, dataset, roles["val"])
         cal = observe(observer, dataset, roles["cal"])
+    draft = dataclasses.replace(draft, images=_images(draft, val, cal))
+    if draft.images is not None and draft.images.colour:
+        val, cal = val.where(val.coloured), cal.where(cal.coloured)
     known, sequence = in_order(val, cal)
     candidates = [
         candidate._replace(
@@ -188,6 +217,15 @@ def calibrated(
     scored = cal.scored(head)
     found = thresholds(head, scored, val.scored(head), draft.rule, draft.joint)
     return draft.calibrated(head, found, counts(scored), selftest)
+
+
+def _images(draft: Draft, *roles: Observed) -> ImageSpec:
+    """Describe the images of val and cal; a solver is used with those of the stated camera."""
+    width, height = roles[0].size
+    if draft.camera is not None:
+        width, height = draft.camera.width, draft.camera.height
+    colour = min(role.coloured.mean() for role in roles) >= _COLOURED
+    return ImageSpec(width=width, height=height, colour=bool(colour))
 
 
 def in_order(*observed: Observed) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
