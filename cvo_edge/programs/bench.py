@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from cvo_edge.bundle.format import Calibration
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import SourceError, UsageError
@@ -97,7 +98,7 @@ def benchmark(
     session = odometer.session
     if session is None:  # pragma: no cover - just loaded
         raise UsageError("bench: expected an open odometer")
-    stream = _Endless(source)
+    stream = _Endless(source, _still_size(odometer.calibration))
     first = next(iter(stream))
     odometer.step(first.image)
     first_interval_ms = _process_age_ms()
@@ -264,8 +265,8 @@ class _Endless:
 
     length = None
 
-    def __init__(self, source: str | None) -> None:
-        self.still = source is None
+    def __init__(self, source: str | None, size: tuple[int, int]) -> None:
+        self.still, self._size = source is None, size
         self._source = source
         self.live = source is not None and names_camera(source)
         # One iterator for all callers, because many cameras serve a single client only.
@@ -283,8 +284,7 @@ class _Endless:
 
     def _again(self) -> Iterator[Callable[[], Frame]]:
         if self._source is None:
-            image = preprocess.selftest_image(_DEFAULT_HEIGHT, _DEFAULT_WIDTH)
-            still = Frame(image, None, "", 0.0)
+            still = Frame(preprocess.selftest_image(*self._size), None, "", 0.0)
             while True:
                 yield lambda: still
         while True:
@@ -293,6 +293,15 @@ class _Endless:
             if first is None:
                 raise SourceError(f"{shown(self._source)}: the source has no frames")
             yield from chain([first], reads)
+
+
+def _still_size(calibration: Calibration) -> tuple[int, int]:
+    """Return height and width of an image of the shape that the bundle expects, 640 wide."""
+    images = calibration.images
+    if images is None:
+        return _DEFAULT_HEIGHT, _DEFAULT_WIDTH
+    width = max(_DEFAULT_WIDTH, calibration.preprocess.width)
+    return round(width * images.height / images.width), width
 
 
 def _stamped(read: Callable[[], Frame], stamp_ns: int) -> Frame:

@@ -219,7 +219,7 @@ def run(
 def bench(
     bundle: BundleArgument,
     source: Annotated[
-        str | None, typer.Argument(help="As for run; default: a fixed 640x480 image.")
+        str | None, typer.Argument(help="As for run; default: a fixed image, 640 pixels wide.")
     ] = None,
     frames: Annotated[int, typer.Option(min=1, max=MOST_MEASURED, help="Frames to measure.")] = 200,
     warmup: Annotated[
