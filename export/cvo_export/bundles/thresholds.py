@@ -192,8 +192,9 @@ def calibrated(
     with draft.observer(model_bytes, first) as observer:
         val = observe(observer, dataset, roles["val"])
         cal = observe(observer, dataset, roles["cal"])
-    draft = dataclasses.replace(draft, images=_images(draft, val, cal))
-    if draft.images is not None and draft.images.colour:
+    images = _images(draft, val, cal)
+    draft = dataclasses.replace(draft, images=images)
+    if images.colour:
         val, cal = val.where(val.coloured), cal.where(cal.coloured)
     known, sequence = in_order(val, cal)
     candidates = [
