@@ -225,7 +225,9 @@ def _images(draft: Draft, *roles: Observed) -> ImageSpec:
     width, height = roles[0].size
     if draft.camera is not None:
         width, height = draft.camera.width, draft.camera.height
-    colour = min(role.coloured.mean() for role in roles) >= _COLOURED
+    coloured = [role.coloured for role in roles]
+    # Without an image with colour, a role would have no frame left.
+    colour = np.concatenate(coloured).mean() >= _COLOURED and all(each.any() for each in coloured)
     return ImageSpec(width=width, height=height, colour=bool(colour))
 
 
