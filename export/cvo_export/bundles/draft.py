@@ -55,6 +55,8 @@ _LEAST_DEVIATION = 1e-6
 _LIMIT_MARGIN = 0.5
 # Least margin in metres and radians where there may be few known poses.
 FEW_POSES_MARGIN = 1.0
+# Share of images with colour from which those without it are doubted, and not calibrated with.
+_COLOURED = 0.95
 # Metres, radians, probabilities. In 8 bits, different rounding on another kind of processor moves
 # outputs by up to 0.005; saturated products move them by more than 0.015 (see boards/).
 _SELFTEST_TOLERANCE: dict[Precision, float] = {"fp32": 1e-3, "int8": 1e-2}
@@ -193,6 +195,20 @@ class Counts(NamedTuple):
     frames: int
     sequences: int
     effective: float
+
+
+def images_of(
+    camera: Camera | None, size: tuple[int, int], coloured: Sequence[NDArray[np.bool_]]
+) -> ImageSpec:
+    """Describe calibration images of a width and height; ``coloured`` (n,) tells role by role.
+
+    The size is that of the bundle's camera, if it states one: a solver that was calibrated with
+    another one is used with its own.
+    """
+    width, height = size if camera is None else (camera.width, camera.height)
+    # Without an image with colour, a role would have no frame left.
+    colour = np.concatenate(coloured).mean() >= _COLOURED and all(each.any() for each in coloured)
+    return ImageSpec(width=width, height=height, colour=bool(colour))
 
 
 def model_spec(model_bytes: bytes, opset: int, provider: Provider = "onnxruntime") -> ModelSpec:

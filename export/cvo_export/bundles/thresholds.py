@@ -16,14 +16,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import (
-    CONFIDENCES,
-    Calibration,
-    ImageSpec,
-    PoseSpec,
-    SixOrUnbounded,
-    Threshold,
-)
+from cvo_edge.bundle.format import CONFIDENCES, Calibration, PoseSpec, SixOrUnbounded, Threshold
 from cvo_edge.conformal import (
     conformal_quantile,
     effective_sample_size,
@@ -39,14 +32,12 @@ from cvo_edge.pose import about
 from cvo_edge.programs.selftest import observe_selftest
 from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import SCOPES, Joint, Rule, Scope, Sides
-from cvo_export.bundles.draft import SELFTEST_SIZE, Counts, Draft
+from cvo_export.bundles.draft import SELFTEST_SIZE, Counts, Draft, images_of
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
 
 
-# Share of images with colour from which those without it are doubted, and not calibrated with.
-_COLOURED = 0.95
 # Margin by which another score must win on val; smaller differences may be chance.
 _CLEARLY = 0.05
 
@@ -192,7 +183,7 @@ def calibrated(
     with draft.observer(model_bytes, first) as observer:
         val = observe(observer, dataset, roles["val"])
         cal = observe(observer, dataset, roles["cal"])
-    images = _images(draft, val, cal)
+    images = images_of(draft.camera, val.size, (val.coloured, cal.coloured))
     draft = dataclasses.replace(draft, images=images)
     if images.colour:
         val, cal = val.where(val.coloured), cal.where(cal.coloured)
@@ -218,17 +209,6 @@ def calibrated(
     scored = cal.scored(head)
     found = thresholds(head, scored, val.scored(head), draft.rule, draft.joint)
     return draft.calibrated(head, found, counts(scored), selftest)
-
-
-def _images(draft: Draft, *roles: Observed) -> ImageSpec:
-    """Describe the images of val and cal; a solver is used with those of the stated camera."""
-    width, height = roles[0].size
-    if draft.camera is not None:
-        width, height = draft.camera.width, draft.camera.height
-    coloured = [role.coloured for role in roles]
-    # Without an image with colour, a role would have no frame left.
-    colour = np.concatenate(coloured).mean() >= _COLOURED and all(each.any() for each in coloured)
-    return ImageSpec(width=width, height=height, colour=bool(colour))
 
 
 def in_order(*observed: Observed) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
