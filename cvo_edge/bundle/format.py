@@ -25,6 +25,10 @@ Text = Annotated[
     str, Meta(min_length=1, max_length=200, pattern="^[^\x00-\x1f\x7f-\x9f\ud800-\udfff]+$(?!\n)")
 ]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$(?!\n)")]
+# Tolerance of the self-test: metres, radians, probabilities. In 8 bits, different rounding on
+# another kind of processor moves outputs by up to 0.005; saturated products move them by more than
+# 0.015 (see boards/).
+SELFTEST_TOLERANCE: dict[Precision, float] = {"fp32": 1e-3, "int8": 1e-2}
 # Far above every plausible value, whether metres, radians, probabilities or scales.
 MAX_NUMBER = 1e9
 Number = Annotated[float, Meta(gt=-MAX_NUMBER, lt=MAX_NUMBER)]

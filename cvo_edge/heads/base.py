@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Threshold
+from cvo_edge.bundle.format import Calibration, Threshold
 from cvo_edge.camera_check import CameraCheck
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
@@ -27,6 +28,14 @@ class Candidate(NamedTuple):
 
     score: str
     parameters: Struct
+
+
+class Limit(NamedTuple):
+    """A number of ``method_parameters``, and the most that it can be."""
+
+    key: str
+    value: float
+    most: float
 
 
 class Solved(NamedTuple):
@@ -72,6 +81,8 @@ class Head(ABC):
     solves: ClassVar[bool] = False
     # For reports: the kind of set that the joint scope has.
     set_kind: ClassVar[str] = "each degree of freedom"
+    # Whether the scores of different frames are finite and differ; a class score may do neither.
+    continuous: ClassVar[bool] = True
     # For reports: why a threshold may be unbounded despite enough calibration frames.
     infinite_score: ClassVar[str] = "too many calibration truths have an infinite score"
 
@@ -120,6 +131,33 @@ class Head(ABC):
     def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
         """Return the marginal confidence of each side's threshold; None for an unbounded side."""
         return (confidence,)
+
+    def levels(self, entry: Threshold, joint: Joint) -> tuple[float | None, ...]:
+        """Return the level of each side's quantile for a threshold; None for an unbounded side."""
+        sides = self.side_confidences(entry.confidence)
+        if entry.scope == "marginal":
+            return sides
+        if joint == "bonferroni":
+            return self.side_confidences(1.0 - (1.0 - entry.confidence) / 6)
+        return tuple(None if level is None else entry.confidence for level in sides)
+
+    def largest_marginal(self, radius: float) -> float:
+        """Return the largest marginal threshold beside a joint one of the same level.
+
+        Only for methods with ``one_joint_score``; infinite if their scores have no such order.
+        """
+        return math.inf
+
+    def score_range(self) -> tuple[float, float]:
+        """Return the least and the largest finite threshold that scores can have."""
+        return -math.inf, math.inf
+
+    def parameter_limits(self, calibration: Calibration) -> tuple[Limit, ...]:
+        """Return the largest values that parameters of an honest bundle have; none by default.
+
+        Honest floors, m and rad, are a small share of the spread of the poses.
+        """
+        return ()
 
     def joint_scale(self, scores: Array) -> JointScale:
         """Val scores (n, sides, 6) -> the scale that makes them comparable in the joint scope."""

@@ -28,9 +28,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import SixOrUnbounded, SixPositive, Threshold
+from cvo_edge.bundle.format import Calibration, SixOrUnbounded, SixPositive, Threshold
 from cvo_edge.errors import CalibrationFileError
-from cvo_edge.heads.base import Candidate, Head
+from cvo_edge.heads.base import Candidate, Head, Limit
 from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import Joint, Scope, Sides
 
@@ -124,6 +124,10 @@ class CqrHead(Head):
             for entry in thresholds:
                 refuse_negative(entry, self.score)
 
+    def parameter_limits(self, calibration: Calibration) -> tuple[Limit, ...]:
+        """As ``Head``."""
+        return below_spread("half_width_floor", self.parameters.half_width_floor, calibration)
+
     def side_confidences(self, confidence: float) -> tuple[float | None, ...]:
         """As ``Head``; ``asymmetric`` gives each side half the miscoverage."""
         return {
@@ -185,6 +189,12 @@ def refuse_negative(entry: Threshold, what: str) -> None:
             f"thresholds.q_hat: expected factors of at least 0 for {what}, found {smallest} at "
             f"{entry.confidence} {entry.scope}"
         )
+
+
+def below_spread(key: str, values: SixPositive, calibration: Calibration) -> tuple[Limit, ...]:
+    """Floors (6,), m and rad -> their limits, the standard deviations of the poses."""
+    pairs = zip(values, calibration.pose.standard_deviation, strict=True)
+    return tuple(Limit(f"{key}[{dof}]", value, most) for dof, (value, most) in enumerate(pairs))
 
 
 @lru_cache(maxsize=64)

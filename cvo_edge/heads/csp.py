@@ -39,6 +39,8 @@ Score = Literal["lac", "aps", "raps"]
 _SIX = np.arange(6)
 # Defaults of the raps score for a bundle without a penalty.
 _PENALTY, _FREE_RANKS = 0.01, 5
+# The likeliest of at most 512 classes has at least this probability; sums of them may exceed 1.
+_LEAST_TOTAL, _SUM = 1e-3, 1e-3
 Edges = Annotated[tuple[Number, ...], Meta(min_length=3, max_length=513)]
 
 
@@ -61,6 +63,7 @@ class CspHead(Head):
     method = "csp"
     parameters_type = CspParameters
     score_names = get_args(Score)
+    continuous = False
     infinite_score = "too many calibration truths lie outside the workspace of the classes"
     parameters: CspParameters
 
@@ -84,11 +87,18 @@ class CspHead(Head):
 
     def joint_scale(self, scores: Array) -> JointScale:
         """Val scores (n, 1, 6) -> the scale that makes DoFs comparable in the joint scope."""
-        top = 1.0
-        if self._score == "raps":
-            ranks = int(self._classes.max()) - self.parameters.free_ranks
-            top += self.parameters.penalty * max(0, ranks)
-        return RankScale.fitted(scores, top)
+        return RankScale.fitted(scores, self._top())
+
+    def score_range(self) -> tuple[float, float]:
+        """As ``Head``."""
+        return 0.0 if self._score == "lac" else _LEAST_TOTAL, self._top() + _SUM
+
+    def _top(self) -> float:
+        """Return the largest finite score."""
+        if self._score != "raps":
+            return 1.0
+        ranks = int(self._classes.max()) - self.parameters.free_ranks
+        return 1.0 + self.parameters.penalty * max(0, ranks)
 
     def scores(
         self,

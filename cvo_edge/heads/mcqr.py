@@ -19,6 +19,7 @@ to the raw hull (r = 1): ``calibration.score`` says whether they are added to it
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -26,11 +27,11 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import SixPositive, Threshold
+from cvo_edge.bundle.format import Calibration, SixPositive, Threshold
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
-from cvo_edge.heads.base import Candidate, Head
-from cvo_edge.heads.cqr import IntervalScore, infinite_where_null, refuse_negative
+from cvo_edge.heads.base import Candidate, Head, Limit
+from cvo_edge.heads.cqr import IntervalScore, below_spread, infinite_where_null, refuse_negative
 from cvo_edge.sets import ConformalSet, Ellipsoids, scaled_distance, unbounded_set
 from cvo_edge.vocabulary import Joint, Scope
 
@@ -93,6 +94,16 @@ class McqrHead(Head):
                     "thresholds.q_hat: expected the same distance of at least 0 six times for mcqr "
                     f"and scope joint, found {list(entry.q_hat)} at {entry.confidence}"
                 )
+
+    def largest_marginal(self, radius: float) -> float:
+        """As ``Head``: a truth in the region lies in its hull, which is the raw one at radius 1."""
+        if self.score == "normalised":
+            return max(1.0, radius)
+        return 0.0 if radius <= 1.0 else math.inf
+
+    def parameter_limits(self, calibration: Calibration) -> tuple[Limit, ...]:
+        """As ``Head``."""
+        return below_spread("half_width_floor", self.parameters.half_width_floor, calibration)
 
     def joint_scale(self, scores: Array) -> JointScale:
         """As ``Head``: no scaling, because all six scores are the same distance."""

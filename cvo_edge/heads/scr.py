@@ -28,13 +28,13 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Number, Positive, SixPositive, Threshold
+from cvo_edge.bundle.format import Calibration, Number, Positive, SixPositive, Threshold
 from cvo_edge.camera_check import CameraCheck, LensLimits, fitted_limits
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.estimate import Reason
-from cvo_edge.heads.base import Candidate, Head, Solved, Solver
-from cvo_edge.heads.cqr import infinite_where_null, refuse_negative
+from cvo_edge.heads.base import Candidate, Head, Limit, Solved, Solver
+from cvo_edge.heads.cqr import below_spread, infinite_where_null, refuse_negative
 from cvo_edge.input.view import SeenCamera
 from cvo_edge.pose_solver import PoseSolver, Solution, dispersion
 from cvo_edge.sets import ConformalSet, Ellipsoids, scaled_distance, unbounded_set
@@ -62,6 +62,8 @@ _LARGEST_LOG = 20.0
 # Deviations, m and rad, that damp the solver or bound a score from below.
 _LEAST_DEVIATION, _LARGEST_DEVIATION = 1e-7, 1e6
 _UNIT = 1e-3
+# No error of a network is a smaller share of its deviation.
+_LEAST_FACTOR = 1e-9
 # Limits lie this far beyond the largest sign of the known frames, because a new recording of the
 # same place has frames that are a little harder.
 _MARGIN_ERROR, _MARGIN_CONTRADICTING = 1.3, 0.05
@@ -135,6 +137,26 @@ class ScrHead(Head):
                     f"thresholds.q_hat: expected the same distance six times for {self.method} and "
                     f"scope joint, found {list(entry.q_hat)} at {entry.confidence}"
                 )
+
+    def largest_marginal(self, radius: float) -> float:
+        """As ``Head``: no error is more deviations long than the distance of all six."""
+        return radius
+
+    def score_range(self) -> tuple[float, float]:
+        """As ``Head``: no error is zero."""
+        return _LEAST_FACTOR, math.inf
+
+    def parameter_limits(self, calibration: Calibration) -> tuple[Limit, ...]:
+        """As ``Head``; errors of more pixels than the input has do not tell places apart."""
+        floors = below_spread("deviation_floor", self.parameters.deviation_floor, calibration)
+        limits, inputs = self.parameters.limits, calibration.preprocess
+        if limits is None:
+            return floors
+        return (
+            *floors,
+            Limit("limits.error_px", limits.error_px, max(inputs.height, inputs.width)),
+            Limit("limits.contradicting", limits.contradicting, LOST),
+        )
 
     def _check_solver(self) -> None:
         """Raise CalibrationFileError for parameters that no solver works with."""

@@ -6,13 +6,15 @@ from textwrap import wrap
 from typing import Any
 
 import msgspec
+import numpy as np
 
-from cvo_edge.bundle.format import Calibration, CalibrationSpec, ImageSpec, Position
+from cvo_edge.bundle.format import Calibration, CalibrationSpec, ImageSpec, Position, SelfTest
 from cvo_edge.camera import Camera
-from cvo_edge.conformal import least_draws
 from cvo_edge.engine.model_cache import ModelCache
+from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.heads.checked import checked_head
+from cvo_edge.heads.plausible import Draws, check_plausible, selftest_sets
 from cvo_edge.pose import Chart
 
 
@@ -44,6 +46,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
         *([] if calibration.images is None else _entry("images", _images(calibration.images))),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
+        *_entry("self-test", _selftest(calibration.selftest)),
         *_entry("backbone", calibration.provenance.backbone or "a network supplied as ONNX"),
         "",
         f"{'q_hat at':<18}" + "".join(f"{name:>10}" for name in dof),
@@ -55,7 +58,20 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         for side, values in sides:
             cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>10}" for v in values)
             lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<18}" + cells)
-    return lines + _unbounded(calibration, head)
+    return [
+        *lines,
+        *_unbounded(calibration, head),
+        *_widths(calibration, head),
+        *_contradiction(calibration, head),
+    ]
+
+
+def _selftest(test: SelfTest) -> str:
+    count = sum(map(len, test.outputs.values()))
+    return (
+        f"{test.width}x{test.height}, {count} numbers within {test.tolerance:g}; widths of its "
+        "sets below, m and rad"
+    )
 
 
 def _position(position_m: Position) -> str:
@@ -85,30 +101,45 @@ def _entry(label: str, text: str) -> list[str]:
     )
 
 
+def _widths(calibration: Calibration, head: Head) -> list[str]:
+    """Return the widths of the self-test image's sets, metres and radians, for each threshold."""
+    dof = Chart(calibration.pose.rotation).dof
+    lines = ["", f"{'width, self-test':<18}" + "".join(f"{name:>10}" for name in dof)]
+    sets = selftest_sets(calibration, head)
+    for entry, found in zip(calibration.thresholds, sets, strict=True):
+        width = found.width()
+        if np.isfinite(width).any():
+            cells = "".join(f"{'unbounded' if w == np.inf else f'{w:.5f}':>10}" for w in width)
+            lines.append(f"{f'{entry.confidence:g} {entry.scope}':<18}" + cells)
+    return lines
+
+
+def _contradiction(calibration: Calibration, head: Head) -> list[str]:
+    try:
+        check_plausible(calibration, head)
+    except CalibrationFileError as error:
+        return ["", *_entry("refused", f"by verify: {error}")]
+    return []
+
+
 def _unbounded(calibration: Calibration, head: Head) -> list[str]:
     """Explain unbounded thresholds: the number of frames or sequences they would need."""
     source = calibration.calibration
-    unit, given = ("frames", source.n)
-    if source.rule == "hierarchical":
-        unit, given = ("sequences", source.n_sequences)
+    draws = Draws.of(source)
     lines = []
     for entry in calibration.thresholds:
-        levels = head.side_confidences(entry.confidence)
-        if entry.scope == "joint" and source.joint == "bonferroni":
-            levels = head.side_confidences(1.0 - (1.0 - entry.confidence) / 6)
-        sides = [
-            (level, q_hat)
-            for level, q_hat in zip(levels, (entry.q_hat, entry.q_hat_upper), strict=False)
+        levels = [
+            level
+            for level, q_hat in zip(
+                head.levels(entry, source.joint), (entry.q_hat, entry.q_hat_upper), strict=False
+            )
             if level is not None and q_hat is not None and None in q_hat
         ]
-        if not sides:
+        if not levels:
             continue
-        level = max(level for level, _ in sides)
-        if entry.scope == "joint" and source.joint == "max":
-            level = entry.confidence
-        needed = least_draws(level)
-        reason = f"needs at least {needed} calibration {unit}, has {given}"
-        if given >= needed:
+        needed = draws.needed(max(levels))
+        reason = f"needs at least {needed} calibration {draws.unit}, has {draws.given}"
+        if draws.given >= needed:
             reason = head.infinite_score
         lines += _entry("unbounded", f"at {entry.confidence:g} {entry.scope}: {reason}")
     return lines

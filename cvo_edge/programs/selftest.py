@@ -18,6 +18,23 @@ def observe_selftest(observer: Observer | Odometer, height: int, width: int) -> 
     return observer.observe(preprocess.selftest_image(height, width), seq=0)
 
 
+def check_reaction(odometer: Odometer) -> None:
+    """Raise GateError if the network gives the same outputs for the self-test image's negative.
+
+    Nothing that a camera or its images do could then change the outputs, and a self-test of such a
+    network tests nothing.
+    """
+    test = odometer.calibration.selftest
+    image = preprocess.selftest_image(test.height, test.width)
+    first, second = (odometer.observe(each, seq=0).outputs for each in (image, 255 - image))
+    names = [spec.name for spec in odometer.calibration.model.outputs]
+    if all(np.array_equal(first[name], second[name]) for name in names):
+        raise GateError(
+            "self-test: expected outputs that depend on the image, found the same for its "
+            "negative; do not use the bundle, its network sees nothing"
+        )
+
+
 def check_selftest(odometer: Odometer) -> float:
     """Compare all outputs with the expected ones; returns the largest absolute difference.
 

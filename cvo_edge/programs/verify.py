@@ -65,7 +65,7 @@ def verify_bundle(
     timeout_s: float = TIMEOUT_S,
     public_key: Path | None = None,
 ) -> Verdict:
-    """Check the digests of a bundle, load it and run its self-test, in a child process.
+    """Check a bundle's digests and numbers, load it and run its self-test, in a child process.
 
     The self-test runs on the model itself and, if the cache holds one, on its cached form. With
     a public key, the signature and the version are checked, too: the version must not be older than
@@ -74,12 +74,12 @@ def verify_bundle(
     Raises
     ------
     CalibrationFileError, BundleMismatchError
-        As ``read_bundle`` and ``Odometer``.
+        As ``read_bundle`` and ``Odometer``; CalibrationFileError also as ``check_plausible``.
     ModelError
         Also if loading and self-test take longer than ``timeout_s`` seconds, need more memory than
         1 GiB plus eight times the model's size plus its threads' stacks, or end the process.
     GateError
-        The model's outputs differ from those of the calibrated model.
+        The model's outputs differ from those of the calibrated model, or never change.
     UsageError
         ``threads`` or ``timeout_s`` is out of range.
     """
@@ -167,8 +167,9 @@ def _selftest(
     from cvo_edge.engine.cores import checked_threads
     from cvo_edge.engine.loading import Bundle, cached_model, read_bundle
     from cvo_edge.engine.model_cache import ModelCache
+    from cvo_edge.heads.plausible import check_plausible
     from cvo_edge.odometer import Odometer
-    from cvo_edge.programs.selftest import check_selftest
+    from cvo_edge.programs.selftest import check_reaction, check_selftest
 
     check = None
     if public_key is not None:
@@ -178,6 +179,7 @@ def _selftest(
     bundle = read_bundle(folder, check=check)
     calibration = bundle.calibration
     _limit(len(bundle.model_bytes), checked_threads(threads), timeout_s)
+    check_plausible(calibration, bundle.head)
     forms = [bundle]
     cached = cached_model(ModelCache.default(), calibration)
     if cached is not None:
@@ -188,6 +190,7 @@ def _selftest(
             form, threads=threads, confidence=first.confidence, scope=first.scope
         ) as odometer:
             worst = max(worst, check_selftest(odometer))
+            check_reaction(odometer)
     return Verdict(calibration.name, worst, calibration.selftest.tolerance)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cvo_edge import geometry
 from cvo_edge.bundle.format import (
     MODEL_FILE,
+    SELFTEST_TOLERANCE,
     Calibration,
     CalibrationSpec,
     ImageSpec,
@@ -57,9 +58,6 @@ _LIMIT_MARGIN = 0.5
 FEW_POSES_MARGIN = 1.0
 # Share of images with colour from which those without it are doubted, and not calibrated with.
 _COLOURED = 0.95
-# Metres, radians, probabilities. In 8 bits, different rounding on another kind of processor moves
-# outputs by up to 0.005; saturated products move them by more than 0.015 (see boards/).
-_SELFTEST_TOLERANCE: dict[Precision, float] = {"fp32": 1e-3, "int8": 1e-2}
 # Operators on 8-bit numbers.
 _QUANTISED = {
     "ConvInteger",
@@ -180,7 +178,7 @@ class Draft:
                 height=height,
                 width=width,
                 outputs=dict(selftest),
-                tolerance=_SELFTEST_TOLERANCE[self.model.precision],
+                tolerance=SELFTEST_TOLERANCE[self.model.precision],
             ),
             provenance=self.provenance,
             camera=self.camera,

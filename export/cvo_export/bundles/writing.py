@@ -9,8 +9,9 @@ from pathlib import Path
 from cvo_edge.bundle.format import CALIBRATION_FILE, MODEL_FILE, Calibration
 from cvo_edge.bundle.reading import encode_calibration, read_calibration
 from cvo_edge.errors import SinkError
+from cvo_edge.heads.plausible import check_plausible
 from cvo_edge.odometer import Odometer
-from cvo_edge.programs.selftest import check_selftest
+from cvo_edge.programs.selftest import check_reaction, check_selftest
 
 
 def check_target(bundle_dir: Path) -> None:
@@ -46,7 +47,9 @@ def write_bundle(bundle_dir: Path, calibration: Calibration, model_bytes: bytes)
         (partial / MODEL_FILE).write_bytes(model_bytes)
         (partial / CALIBRATION_FILE).write_bytes(content)
         with Odometer.load(partial) as odometer:
+            check_plausible(odometer.calibration, odometer.head)
             check_selftest(odometer)
+            check_reaction(odometer)
         replaced = None
         if bundle_dir.exists():
             replaced = Path(tempfile.mkdtemp(prefix=f".{bundle_dir.name}.", dir=parent)) / "old"
