@@ -97,7 +97,10 @@ class RecordedInterval(_Strict, frozen=True):
 
 
 class Record(_Strict, frozen=True):
-    """The output for one frame: one JSON line, one CSV row or one line of the table."""
+    """The output for one frame: one JSON line, one CSV row or one line of the table.
+
+    ``factor`` is UNSET (no key) unless the thresholds adapt to labels.
+    """
 
     seq: int
     stamp_ns: int | None
@@ -107,6 +110,7 @@ class Record(_Strict, frozen=True):
     pose: RecordedPose | None
     interval: RecordedInterval | None
     latency_ms: dict[str, float]
+    factor: tuple[float, ...] | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +136,10 @@ class PoseInterval:
         Meaning of the six numbers.
     latency_ms
         Milliseconds per stage: read, preprocess, model, conformal, total.
+    factor
+        What labels have made of the thresholds: 1 as calibrated, more is wider. One number in the
+        joint scope, six in the marginal one (twelve for methods with two thresholds per DoF: lower,
+        then upper); None if the odometer does not adapt.
     """
 
     seq: int
@@ -145,6 +153,7 @@ class PoseInterval:
     scope: Scope
     chart: Chart
     latency_ms: Mapping[str, float] = field(default_factory=dict)
+    factor: tuple[float, ...] | None = None
 
     @property
     def lower(self) -> Array:
@@ -237,6 +246,7 @@ class PoseInterval:
             pose,
             interval,
             dict(self.latency_ms),
+            UNSET if self.factor is None else self.factor,
         )
 
     def to_dict(self, *, region: bool = False) -> dict[str, Any]:

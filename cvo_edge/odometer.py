@@ -27,6 +27,8 @@ from cvo_edge.estimate import PoseInterval, Reason, Status
 from cvo_edge.input.clock import SYSTEM_CLOCK
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.frame_checks import StreamChecks
+from cvo_edge.monitor.adaptation import Adaptation, Level
+from cvo_edge.monitor.labelled import Labelled
 from cvo_edge.pose import Pose
 from cvo_edge.scheduling import checked_mode, plan, run_stream
 from cvo_edge.sets import ConformalSet, unbounded_set
@@ -39,7 +41,8 @@ class Processed(NamedTuple):
     """One frame before its stream checks: the result of a worker and the input of ``conclude``.
 
     ``conformal_set`` is unbounded if the observation has a fault or a doubt. ``conformal_ms`` is
-    the time for the set, ``total_ms`` the time from reading the frame to the set.
+    the time for the set, ``total_ms`` the time from reading the frame to the set, ``level`` the
+    thresholds of the set if the odometer adapts.
     """
 
     frame: Frame
@@ -48,9 +51,10 @@ class Processed(NamedTuple):
     conformal_set: ConformalSet
     conformal_ms: float
     total_ms: float
+    level: Level | None = None
 
 
-class Odometer:
+class Odometer(Labelled):
     """Estimates pose intervals from camera images with one bundle.
 
     One instance serves one stream and numbers its frames. Use it as a context manager, or call
@@ -74,6 +78,10 @@ class Odometer:
     camera
         The camera that takes the images, if it is not the bundle's own. For methods that do not
         solve for the pose, its images must show all that those of the bundle's camera show.
+    adapt
+        Adapt the thresholds to the labels that ``update`` gets.
+    state
+        File that keeps what was adapted; implies ``adapt``. Errors: ``StateFile``.
 
     Raises
     ------
@@ -93,6 +101,8 @@ class Odometer:
         confidence: float = 0.9,
         scope: Scope = "marginal",
         camera: Camera | None = None,
+        adapt: bool = False,
+        state: str | os.PathLike[str] | None = None,
     ) -> None:
         calibration = bundle.calibration
         self.calibration = calibration
@@ -123,6 +133,8 @@ class Odometer:
         self._stream_checks = StreamChecks()
         self._sizes = self._observer.stream_sizes()
         self._camera_check = self._observer.camera_check()
+        if adapt or state is not None:
+            self._adaptation = Adaptation(self.head, self.chart, calibration, self.threshold, state)
         self._clock = SYSTEM_CLOCK
         self._stepping = Lock()
         self._seq = 0
@@ -137,6 +149,8 @@ class Odometer:
         confidence: float = 0.9,
         scope: Scope = "marginal",
         camera: Camera | None = None,
+        adapt: bool = False,
+        state: str | os.PathLike[str] | None = None,
         cache: ModelCache | None = None,
         public_key: str | os.PathLike[str] | None = None,
     ) -> Odometer:
@@ -164,6 +178,8 @@ class Odometer:
                 confidence=confidence,
                 scope=scope,
                 camera=camera,
+                adapt=adapt,
+                state=state,
             )
 
         try:
@@ -281,10 +297,12 @@ class Odometer:
         observation = self.observe(frame.image, seq)
         observed = perf_counter()
         usable = observation.fault is None and observation.doubt is None
-        found = self.conformal_set(observation) if usable else unbounded_set()
+        level = None if self._adaptation is None else self._adaptation.level
+        threshold = self.threshold if level is None else level.threshold
+        found = self.conformal_set(observation, threshold) if usable else unbounded_set()
         end = perf_counter()
         conformal_ms, total_ms = 1e3 * (end - observed), waited_ms + 1e3 * (end - start)
-        return Processed(frame, seq, observation, found, conformal_ms, total_ms)
+        return Processed(frame, seq, observation, found, conformal_ms, total_ms, level)
 
     def conclude(self, processed: Processed) -> PoseInterval:
         """Apply the stream checks and build the estimate; call it once per frame, in order.
@@ -307,6 +325,9 @@ class Odometer:
         if self.origin_m is not None:
             origin_m = np.array(self.origin_m)
             position_m, found = position_m + origin_m, found.moved(origin_m)
+        level = processed.level
+        if self._adaptation is not None and level is not None:
+            self._adaptation.remember(processed.seq, level, None if doubts else observation)
         return PoseInterval(
             seq=processed.seq,
             stamp_ns=frame.stamp_ns,
@@ -325,6 +346,7 @@ class Odometer:
                 "conformal": round(processed.conformal_ms, 4),
                 "total": round(processed.total_ms, 4),
             },
+            factor=None if level is None else level.factor,
         )
 
     def _camera_differs(self, observation: Observation, doubts: tuple[Reason, ...]) -> bool:
@@ -363,7 +385,7 @@ class Odometer:
     def conformal_set(
         self, observation: Observation, threshold: Threshold | None = None
     ) -> ConformalSet:
-        """Return the set of an observation, by default with the odometer's threshold."""
+        """Return the set of an observation, by default with the calibrated threshold."""
         return self.head.conformal_set(
             observation.outputs, observation.point, threshold or self.threshold
         )

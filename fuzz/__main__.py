@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bench.provenance import RESULTS, write_result
-from fuzz import bundles, kills, media, sensors, simulation
+from fuzz import bundles, kills, media, sensors, simulation, states
 from fuzz.trials import Tally
 
 FAULTS = RESULTS / "faults"
@@ -33,6 +33,7 @@ KINDS: dict[str, tuple[str, int, Callable[[int], Tally]]] = {
         bundles.calibrations_that_fit,
     ),
     "kills": ("run killed at a random time", 1000, kills.kills),
+    "states": ("writer of a state file killed at a random time", 10000, states.states),
     "sensors": ("faulted frames of a camera among as many clean ones", 10000, sensors.sensors),
     "recordings": ("clean frames of real recordings", 1000, sensors.recordings),
     "images": ("image files with changed bytes among intact ones", 2000, media.images),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -162,6 +162,17 @@ class Head(ABC):
     def joint_scale(self, scores: Array) -> JointScale:
         """Val scores (n, sides, 6) -> the scale that makes them comparable in the joint scope."""
         return LinearScale.fitted(scores)
+
+    def shifts(self, scope: Scope) -> bool:
+        """Whether adaptation adds to the thresholds; by default it multiplies them.
+
+        Multiples need scores that are never negative and have no upper end.
+        """
+        return False
+
+    def scored_outputs(self) -> Collection[str]:
+        """Return the names of the outputs that ``scores`` reads; by default all."""
+        return self.outputs
 
     @abstractmethod
     def scores(

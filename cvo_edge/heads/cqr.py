@@ -137,6 +137,10 @@ class CqrHead(Head):
             "upper": (None, confidence),
         }[self._sides]
 
+    def shifts(self, scope: Scope) -> bool:
+        """As ``Head``; additive scores, and those of a single side, may be negative."""
+        return self.score == "additive" or self._sides != "symmetric"
+
     def scores(
         self,
         outputs: Mapping[str, NDArray[Any]],

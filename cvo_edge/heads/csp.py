@@ -93,6 +93,10 @@ class CspHead(Head):
         """As ``Head``."""
         return 0.0 if self._score == "lac" else _LEAST_TOTAL, self._top() + _SUM
 
+    def shifts(self, scope: Scope) -> bool:
+        """As ``Head``; scores of classes have an end, where a set holds every class."""
+        return True
+
     def _top(self) -> float:
         """Return the largest finite score."""
         if self._score != "raps":

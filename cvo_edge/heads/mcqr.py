@@ -109,6 +109,10 @@ class McqrHead(Head):
         """As ``Head``: no scaling, because all six scores are the same distance."""
         return LinearScale(np.ones(scores.shape[1:]))
 
+    def shifts(self, scope: Scope) -> bool:
+        """As ``Head``; the marginal additive score may be negative."""
+        return scope == "marginal" and self.score == "additive"
+
     def scores(
         self,
         outputs: Mapping[str, NDArray[Any]],

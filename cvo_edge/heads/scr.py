@@ -20,7 +20,7 @@ stream, the frames also show whether the camera is the stated one (``cvo_edge.ca
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -294,6 +294,10 @@ class ScrHead(Head):
     def joint_scale(self, scores: Array) -> JointScale:
         """As ``Head``; one distance needs no scaling."""
         return LinearScale(np.ones(scores.shape[1:]))
+
+    def scored_outputs(self) -> Collection[str]:
+        """As ``Head``: the scale of the errors, without the cells."""
+        return ("scale",)
 
     def scores(
         self,

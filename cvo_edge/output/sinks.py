@@ -190,6 +190,7 @@ def _csv_heading(header: Header | None, estimate: PoseInterval) -> bytes:
         "bounded",
         *(f"{name}_bands" for name in dof),
         *(f"{name}_ms" for name in _CSV_LATENCIES),
+        *(("factor",) if estimate.factor is not None else ()),
     ]
     return _comments(header, estimate) + _csv_row(columns)
 
@@ -207,6 +208,8 @@ def _csv_line(estimate: PoseInterval) -> bytes:
     else:
         row += [None] * 22
     row += [record.latency_ms.get(stage) for stage in _CSV_LATENCIES]
+    if record.factor:
+        row.append(" ".join(map(repr, record.factor)))
     return _csv_row(row)
 
 

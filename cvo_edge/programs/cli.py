@@ -20,10 +20,16 @@ from cvo_edge.programs.options import (
     BundleArgument,
     CacheOption,
     CameraOption,
+    GroundTruthOption,
     JsonOption,
+    LabelDelayOption,
+    LabelsOption,
+    MaxFramesOption,
     PublicKeyOption,
     RegionOption,
+    StateOption,
     ThreadsOption,
+    TimeoutOption,
     examples,
 )
 from cvo_edge.vocabulary import Format, Mode, Scope
@@ -38,8 +44,8 @@ app = typer.Typer(
     "freedom, an interval that holds the truth with a stated probability.",
 )
 
-# A thousand years of a camera; as many times as fit into memory.
-MOST_FRAMES, MOST_MEASURED = 10**12, 10**7
+# As many times as fit into memory.
+MOST_MEASURED = 10**7
 
 
 @app.command("demo")
@@ -92,14 +98,7 @@ def run(
         ),
     ] = None,
     region: RegionOption = False,
-    ground_truth: Annotated[
-        Path | None,
-        typer.Option(
-            help="TUM file or folder of .pose.txt; adds coverage to the summary.",
-            readable=False,
-            rich_help_panel=REPORT,
-        ),
-    ] = None,
+    ground_truth: GroundTruthOption = None,
     quiet: Annotated[
         bool,
         typer.Option("--quiet", help="No progress or summary.", rich_help_panel=REPORT),
@@ -115,24 +114,16 @@ def run(
             rich_help_panel=INTERVALS,
         ),
     ] = "marginal",
+    labels: LabelsOption = None,
+    label_delay: LabelDelayOption = 0,
+    state: StateOption = None,
     fps: Annotated[
         float | None,
         typer.Option(help="Stamp frames at this rate, from zero.", rich_help_panel="Input"),
     ] = None,
     camera: CameraOption = None,
-    max_frames: Annotated[
-        int | None,
-        typer.Option(
-            min=1, max=MOST_FRAMES, help="Stop after this many frames.", rich_help_panel="Input"
-        ),
-    ] = None,
-    timeout: Annotated[
-        float,
-        typer.Option(
-            help="Seconds to wait for the next frame of a camera or video.",
-            rich_help_panel="Input",
-        ),
-    ] = 5.0,
+    max_frames: MaxFramesOption = None,
+    timeout: TimeoutOption = 5.0,
     mode: Annotated[
         Mode | None,
         typer.Option(
@@ -156,13 +147,15 @@ def run(
     from cvo_edge.odometer import Odometer
     from cvo_edge.output.records import header_of
     from cvo_edge.output.sinks import Sink, format_of
+    from cvo_edge.programs.labels import Labels
     from cvo_edge.programs.progress import frames_progress
     from cvo_edge.programs.run import RunSummary
     from cvo_edge.programs.run import run as run_frames
 
     written_as = format_of(output, format)
-    _refuse_overwriting(output, source, ground_truth, bundle, public_key, camera)
+    _refuse_overwriting(output, source, ground_truth, bundle, public_key, camera, labels, state)
     truth = open_ground_truth(ground_truth) if ground_truth else None
+    labelled = open_ground_truth(labels) if labels else None
     frames = open_source(source, fps, timeout)
     with Odometer.load(
         bundle,
@@ -171,6 +164,8 @@ def run(
         confidence=confidence,
         scope=scope,
         camera=read_camera(camera) if camera else None,
+        adapt=labels is not None,
+        state=state,
         cache=_model_cache(cache),
         public_key=public_key,
     ) as odometer:
@@ -197,6 +192,7 @@ def run(
                         sink.write,
                         summary=summary,
                         truth=truth,
+                        labels=Labels(odometer, labelled, label_delay) if labelled else None,
                         max_frames=max_frames,
                         tick=tick,
                     )

@@ -8,6 +8,11 @@ from typing import Annotated
 import typer
 
 INTERVALS, RUNTIME, REPORT = "Intervals", "Runtime", "Output"
+ADAPTATION = "Adaptation"
+# A thousand years of a camera.
+MOST_FRAMES = 10**12
+# An odometer keeps 1,024 frames for their labels.
+MOST_DELAY = 1023
 
 
 def examples(*commands: str) -> str:
@@ -59,6 +64,63 @@ RegionOption = Annotated[
         "--region",
         help="Write the region into every record (mcqr, scr, fused; joint scope).",
         rich_help_panel=REPORT,
+    ),
+]
+MaxFramesOption = Annotated[
+    int | None,
+    typer.Option(
+        "--max-frames",
+        min=1,
+        max=MOST_FRAMES,
+        help="Stop after this many frames.",
+        rich_help_panel="Input",
+    ),
+]
+TimeoutOption = Annotated[
+    float,
+    typer.Option(
+        "--timeout",
+        help="Seconds to wait for the next frame of a camera or video.",
+        rich_help_panel="Input",
+    ),
+]
+GroundTruthOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="TUM file or folder of .pose.txt; adds coverage to the summary.",
+        readable=False,
+        rich_help_panel=REPORT,
+    ),
+]
+LabelsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--labels",
+        help="TUM file or folder of .pose.txt with true poses of some frames; the intervals "
+        "adapt to them.",
+        readable=False,
+        show_default=False,
+        rich_help_panel=ADAPTATION,
+    ),
+]
+LabelDelayOption = Annotated[
+    int,
+    typer.Option(
+        "--label-delay",
+        min=0,
+        max=MOST_DELAY,
+        help="Frames from a frame to its label.",
+        rich_help_panel=ADAPTATION,
+    ),
+]
+StateOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--state",
+        help="File that keeps what was adapted for the next run.",
+        readable=False,
+        show_default=False,
+        rich_help_panel=ADAPTATION,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -18,6 +18,7 @@ from cvo_edge.ground_truth import GroundTruth
 from cvo_edge.input.frame import Source
 from cvo_edge.input.image_files import ImageFiles, left_out_text
 from cvo_edge.odometer import Odometer
+from cvo_edge.programs.labels import Labels
 from cvo_edge.programs.measure import LatencyProfile, memory_mib
 
 Array = NDArray[np.float64]
@@ -34,7 +35,8 @@ class RunSummary:
     gap in some degree of freedom; ``skipped`` counts frames dropped for a newer one; ``matched``
     counts frames that have a true pose, ``compared`` those of status ok among them, and ``covered``
     those whose set holds the true value, per degree of freedom; ``camera`` is what the frames show
-    of the camera, if they do; ``left_out`` counts the images of a folder that are no frames.
+    of the camera, if they do; ``left_out`` counts the images of a folder that are no frames;
+    ``labels`` are those that the thresholds have adapted to.
     """
 
     dof: tuple[str, ...]
@@ -54,6 +56,7 @@ class RunSummary:
     covered_jointly: int = 0
     camera: LensEstimate | None = None
     left_out: Mapping[str, int] = field(default_factory=dict)
+    labels: Labels | None = None
     # Frames are numbered from 0, so that dropped frames at the start are counted, too.
     _last_seq: int = -1
 
@@ -100,6 +103,8 @@ class RunSummary:
                 f"camera      by {frames} frames: fx {fx:.3f} x and fy {fy:.3f} x the stated, "
                 f"k1 {k1:+.3f}" + ("; check the stated intrinsics" if wrong else "")
             )
+        if self.labels is not None:
+            lines.append(self.labels.line())
         latency = self.latency.summary()
         if latency:
             total, model = latency["total"], latency["model"]
@@ -138,21 +143,25 @@ def run(
     *,
     summary: RunSummary,
     truth: GroundTruth | None = None,
+    labels: Labels | None = None,
     max_frames: int | None = None,
     tick: Callable[[], None] | None = None,
 ) -> None:
     """Estimate all ``frames``; write each estimate and count it in ``summary``.
 
     The caller owns the summary and can show it even if the source ends early. ``tick`` is called
-    after each frame.
+    after each frame. The odometer gets the labels whose time has come after each estimate.
     """
     if isinstance(frames, ImageFiles):
         summary.left_out = frames.left_out
+    summary.labels = labels
     try:
         with closing(odometer.stream(frames)) as estimates:
             for estimate in islice(estimates, max_frames):
                 write(estimate)
                 summary.add(estimate, truth.pose_of(estimate) if truth else None)
+                if labels is not None:
+                    labels.after(estimate)
                 if tick is not None:
                     tick()
     finally:

@@ -18,6 +18,7 @@ from cvo_edge.heads import HEADS
 from cvo_edge.odometer import Odometer
 from cvo_edge.vocabulary import Rule
 from cvo_export.bundles.figures import Claim, Sets, point_error
+from cvo_export.bundles.online import Schedule, Stage, online, online_lines
 from cvo_export.bundles.thresholds import observe, with_thresholds
 from cvo_export.data.noise import Noise, noisy
 from cvo_export.data.splits import Split, same_split
@@ -38,6 +39,8 @@ def evaluate(
     subset: Subset,
     threads: int | None = None,
     noise: Noise | None = None,
+    schedule: Schedule | None = None,
+    then: Noise | None = None,
 ) -> dict[str, Any]:
     """Evaluate every stored confidence and scope; the report of ``cvo-export evaluate --json``.
 
@@ -49,13 +52,20 @@ def evaluate(
     the run's cal frames under the same noise (``recalibrated``). Without noise, a run that was
     split by sequence is also evaluated with the other calibration rule (``other_rule``).
 
+    With a ``schedule`` of labels, the frames are also played in order, clean, with the noise
+    ``then``, and clean again, and the thresholds adapt to the labels (``online``).
+
     Raises
     ------
     SourceError
         The data set is not the one that was split, or no frame passes the checks.
     UsageError
-        Noise with the subset ``all``.
+        Noise with the subset ``all``; a schedule with ``noise``; ``then`` without a schedule.
     """
+    if (schedule is None and then is not None) or (schedule is not None and noise is not None):
+        raise UsageError(
+            "then: expected --online every=K,delay=D with --then NOISE and without --noise"
+        )
     bundle = read_bundle(bundle_dir)
     calibration = bundle.calibration
     recorded = calibration.calibration.split
@@ -68,6 +78,7 @@ def evaluate(
                 f"on, found {subset}"
             )
         dataset = noisy(dataset, noise, recorded.seed)
+    later = None if then is None else noisy(dataset, then, recorded.seed)
     indices = subset_indices(calibration, dataset, subset)
     claim: Claim = "exact" if split is not None and split.kind == "random" else "indicative"
     with Odometer(
@@ -104,6 +115,12 @@ def evaluate(
             "levels": levels,
             "sequences": sets.sequences(dataset),
         }
+        if schedule is not None:
+            stages = [Stage("clean", indices, seen)]
+            if later is not None:
+                changed = Stage(str(then), indices, observe(odometer, later, indices))
+                stages = [*stages, changed, *stages]
+            report["online"] = online(odometer, calibration, dataset.poses, stages, schedule)
         if split is not None and noise is not None:
             again = _recalibrated(odometer, dataset, split, calibration)
             others = Sets(odometer, seen, again, claim)
@@ -183,7 +200,8 @@ def table(report: Mapping[str, Any]) -> list[str]:
         if "other_rule" in report:
             other = report["other_rule"]
             lines += ["", *_level_lines(report["method"], other["rule"], other["levels"])]
-        return lines + _sequence_lines(report["sequences"])
+        lines += _sequence_lines(report["sequences"])
+        return [*lines, "", *online_lines(report["online"])] if "online" in report else lines
     again = report["recalibrated"]
     return [
         *lines,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fuzz import bundles, kills, media, sensors, simulation
+from fuzz import bundles, kills, media, sensors, simulation, states
 from fuzz.__main__ import KINDS, main
 from fuzz.mutate import changed_bytes, changed_document, with_digest
 from fuzz.trials import Ended
@@ -14,6 +14,7 @@ SHORT = {
     "calibrations": 400,
     "calibrations_that_fit": 6,
     "kills": 4,
+    "states": 24,
     "sensors": 200,
     "recordings": 40,
     "images": 40,
@@ -26,6 +27,7 @@ SEEN = {
     # An invalid model, which is reached only if the digests fit.
     "models_that_fit": "exit code 4",
     "kills": "whole",
+    "states": "the old state, and an unfinished file",
     "calibrations": "exit code 3",
     "calibrations_that_fit": "exit code 3",
     "sensors": "frozen, degraded",
@@ -71,6 +73,16 @@ def test_disabled_checks_lead_to_findings(monkeypatch, artifacts_dir):
 def test_what_was_seen_and_is_not_there_is_lost(monkeypatch):
     monkeypatch.setattr(kills, "read_records", lambda _: iter(()))
     assert list(kills.kills(1).outcomes) == ["lost"]
+
+
+def test_a_writer_that_leaves_half_a_state_or_an_older_one_is_found(monkeypatch):
+    program = "import fuzz.states as s; w = s.StateFile.write; s.StateFile.write = {}; s.serve()"
+    half = "lambda self, _: self.path.write_bytes(b'{')"
+    monkeypatch.setattr(states, "_PROGRAM", program.format(half))
+    assert list(states.states(1).outcomes) == ["unreadable"]
+    older = "lambda self, state: state.labels or w(self, state)"
+    monkeypatch.setattr(states, "_PROGRAM", program.format(older))
+    assert "another state" in states.states(8).outcomes
 
 
 def test_another_pose_behind_a_damaged_image_is_found(monkeypatch):

@@ -21,6 +21,7 @@ from cvo_export.vocabulary import Subset
         "cvo-export evaluate bundles/redkitchen 7scenes:scenes/redkitchen",
         "cvo-export evaluate bundles/redkitchen 7scenes:new-flights --subset all",
         "cvo-export evaluate bundles/room synthetic:room --noise speckle:0.3",
+        "cvo-export evaluate bundles/room synthetic:room --online every=20,delay=5 --then speckle",
     )
 )
 def evaluate(
@@ -34,6 +35,20 @@ def evaluate(
         typer.Option(
             metavar="NAME[:STRENGTH]",
             help="Degrade the frames, e.g. speckle:0.3.",
+        ),
+    ] = None,
+    online: Annotated[
+        str | None,
+        typer.Option(
+            metavar="every=K,delay=D",
+            help="Adapt to a label for every K-th frame, D frames late.",
+        ),
+    ] = None,
+    then: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME[:STRENGTH]",
+            help="With --online: play the frames clean, with this noise, and clean again.",
         ),
     ] = None,
     json_file: Annotated[
@@ -51,12 +66,15 @@ def evaluate(
     thresholds and for thresholds of calibration frames with the same noise. NAME
     is gaussian, salt-and-pepper, speckle, motion-blur, exposure or occlusion.
     """
+    from cvo_export.bundles.online import parse_schedule
     from cvo_export.data.noise import parse_noise
     from cvo_export.evaluate import check_coverage, table
     from cvo_export.evaluate import evaluate as evaluate_bundle
 
     parsed = None if noise is None else parse_noise(noise)
-    report = evaluate_bundle(bundle, opened(dataset), subset, threads, parsed)
+    schedule = None if online is None else parse_schedule(online)
+    changed = None if then is None else parse_noise(then)
+    report = evaluate_bundle(bundle, opened(dataset), subset, threads, parsed, schedule, changed)
     if json_file is not None:
         write_text(json_file, json.dumps(report, indent=1) + "\n")
     if json_file != "-":

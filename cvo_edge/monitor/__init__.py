@@ -1,0 +1,1 @@
+"""What watches an odometer at work, and corrects it: adaptation to labels."""
