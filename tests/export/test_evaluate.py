@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from cvo_edge import Odometer
-from cvo_edge.errors import CvoError, GateError, SourceError
+from cvo_edge.errors import CvoError, GateError, SourceError, UsageError
 from cvo_export.bundles.figures import coverage_band
+from cvo_export.bundles.online import Schedule, parse_schedule
 from cvo_export.cli import app
+from cvo_export.data.noise import parse_noise
 from cvo_export.datasets import open_dataset
 from cvo_export.evaluate import check_coverage, evaluate, find_level, table
 
@@ -104,6 +106,51 @@ def test_table_shows_every_level(report):
     assert text.count("marginal") == 5
     assert text.count("joint ") >= 5
     assert text.count("-   ") >= 2  # unbounded sets have no band
+
+
+def test_labels_bring_coverage_back_after_a_change(tiny_bundle, tiny_run):
+    schedule, dark = parse_schedule("every=5,delay=3"), parse_noise("exposure:-3")
+    report = evaluate(tiny_bundle, tiny_run.dataset, "test", 1, None, schedule, dark)
+    online = report["online"]
+    assert (online["every"], online["delay"], online["eta"]) == (5, 3, 0.3)
+    assert [row["scope"] for row in online["rows"]] == ["marginal"] * 2 + ["joint"] * 2
+    for plain, adapted in zip(online["rows"][::2], online["rows"][1::2], strict=True):
+        assert [stage["stage"] for stage in plain["stages"]] == ["clean", str(dark), "clean"]
+        assert {stage["width_ratio"] for stage in plain["stages"]} == {1.0}
+        later = [
+            [stage["windows"][2]["coverage"] for stage in row["stages"]] for row in (plain, adapted)
+        ]
+        assert later[0][1] < 0.8
+        assert abs(later[1][1] - 0.9) < 0.05
+        assert abs(adapted["labelled_missed"] - 0.1) <= adapted["bound"]
+    level = find_level(report["levels"], 0.9, "joint")["joint_coverage"]
+    clean = online["rows"][2]["stages"][0]["windows"]
+    total = sum(window["frames"] * window["coverage"] for window in clean)
+    assert total / online["frames"] == pytest.approx(level)
+    text = table(report)
+    assert [line.split()[:2] for line in text if "every=5,delay=3" in line] == [
+        ["marginal", "every=5,delay=3"],
+        ["joint", "every=5,delay=3"],
+    ]
+    json.dumps(report, allow_nan=False)
+
+
+@pytest.mark.parametrize("text", ["every=0,delay=5", "every=5", "20,5", "every=5,delay=1024"])
+def test_a_schedule_that_cannot_be_kept_is_refused(text):
+    with pytest.raises(UsageError) as caught:
+        parse_schedule(text)
+    assert str(caught.value) == (
+        "online: expected every=K,delay=D with K of at least 1 and D of at most 1023, found "
+        f"{text!r}"
+    )
+    assert parse_schedule("every=20,delay=0") == Schedule(20, 0)
+
+
+def test_noise_and_then_are_told_apart(tiny_bundle, tiny_run):
+    noise = parse_noise("occlusion")
+    for arguments in ((None, None, noise), (noise, Schedule(5, 5), None)):
+        with pytest.raises(UsageError, match="then: expected --online every=K,delay=D with --then"):
+            evaluate(tiny_bundle, tiny_run.dataset, "test", 1, *arguments)
 
 
 def cvo_export(*arguments):

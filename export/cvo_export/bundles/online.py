@@ -1,7 +1,7 @@
 """Coverage of thresholds that adapt to labels, on frames that are played in order.
 
 The stages are the frames as they are, with a noise, and as they are again; the thresholds do not
-know when a stage begins.
+know when a stage begins. Few frames are played several times, so that a stage outlasts the change.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from cvo_export.bundles.thresholds import Observed
 Array = NDArray[np.float64]
 
 CONFIDENCE = 0.9
-# Frames since the last change: first and end.
+# Least number of frames in a stage; windows of frames since the last change: first and end.
+_LEAST = 600
 WINDOWS: tuple[tuple[int, int | None], ...] = ((0, 100), (100, 300), (300, None))
 
 
@@ -78,12 +79,21 @@ def online(
 
     Raises UsageError if the thresholds of a scope are unbounded.
     """
+    times = -(-_LEAST // len(stages[0].indices))
+    stages = [stage._replace(indices=np.tile(stage.indices, times)) for stage in stages]
     rows = [
         _played(odometer, calibration, poses, stages, scope, labels)
         for scope in SCOPES
         for labels in (None, schedule)
     ]
-    return {**asdict(schedule), "confidence": CONFIDENCE, "eta": schedule.eta, "rows": rows}
+    return {
+        **asdict(schedule),
+        "eta": schedule.eta,
+        "confidence": CONFIDENCE,
+        "frames": len(stages[0].indices),
+        "times": times,
+        "rows": rows,
+    }
 
 
 def _played(
@@ -103,6 +113,7 @@ def _played(
     for stage in stages:
         seen = stage.seen
         row_of = {index: row for row, index in enumerate(seen.indices.tolist())}
+        calibrated = seen.sets(head, start)
         covered = np.full(len(stage.indices), np.nan)
         wider = []
         for number, index in enumerate(stage.indices.tolist()):
@@ -114,11 +125,13 @@ def _played(
             else:
                 outputs = {name: values[row : row + 1] for name, values in seen.outputs.items()}
                 point, truth = seen.point[row], seen.truth[row]
-                got = head.conformal_set(outputs, point, level.threshold)
+                got = calibrated[row]
+                if schedule is not None:
+                    got = head.conformal_set(outputs, point, level.threshold)
                 covered[number] = (
                     got.contains(truth) if scope == "joint" else got.covers(truth).mean()
                 )
-                wider.append(got.width() / head.conformal_set(outputs, point, start).width())
+                wider.append(got.width() / calibrated[row].width())
                 adaptation.remember(seq, level, Observation(outputs, seen.pose[row], point))
                 if schedule is not None and seq % schedule.every == 0:
                     coming.append((seq, poses[index]))
@@ -152,8 +165,10 @@ def online_lines(report: Mapping[str, Any]) -> list[str]:
     stages = rows[0]["stages"]
     windows = "".join(f"{f'{first}-{end}' if end else 'later':>8}" for first, end in WINDOWS)
     lines = [
-        f"coverage at {report['confidence']:g} of the frames after each change; width: over the "
-        "calibrated one; marginal: mean of six",
+        f"online: {report['frames']} frames a stage"
+        + (f", all frames {report['times']} times" if report["times"] > 1 else "")
+        + f"; coverage at {report['confidence']:g} by frames since the change (marginal: mean of "
+        "six), mean width over the calibrated one",
         f"{'':<28}" + "".join(f"{stage['stage']:^32}" for stage in stages),
         f"{'scope':<10}{'labels':<18}" + f"{windows}{'width':>8}" * len(stages),
     ]
