@@ -108,7 +108,8 @@ def test_table_shows_every_level(report):
     assert text.count("-   ") >= 2  # unbounded sets have no band
 
 
-def test_labels_bring_coverage_back_after_a_change(tiny_bundle, tiny_run):
+def test_labels_bring_coverage_back_after_a_change(tiny_bundle, tiny_run, monkeypatch):
+    monkeypatch.setattr("cvo_export.bundles.online._LEAST", 400)
     schedule, dark = parse_schedule("every=5,delay=3"), parse_noise("exposure:-3")
     report = evaluate(tiny_bundle, tiny_run.dataset, "test", 1, None, schedule, dark)
     online = report["online"]
