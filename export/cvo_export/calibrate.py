@@ -17,9 +17,11 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import (
+    MAX_NUMBER,
     Calibration,
     PoseLimits,
     PoseSpec,
+    Position,
     PreprocessSpec,
     Provenance,
     TensorSpec,
@@ -74,6 +76,7 @@ def calibrate(
     sides: Sides | None = None,
     rotation: GivenRotation | None = None,
     crop: Crop | None = None,
+    origin_m: Position | None = None,
     new_data: bool = False,
     provider: Provider | None = None,
 ) -> Calibration:
@@ -85,7 +88,8 @@ def calibrate(
     the sequences on that list are used. If the bundle's run was split from this data set, the
     ``val`` and ``cal`` roles of that run are used.
 
-    ``rotation`` (None: ``tangent_predicted``) and ``crop`` (None: ``none``) describe a model file.
+    ``rotation`` (None: ``tangent_predicted``), ``crop`` (None: ``none``) and ``origin_m`` (None:
+    the world's own) describe a model file; its positions are relative to that origin.
     ``new_data`` states that a data set with the name of the training data contains none of its
     frames. ``provider`` (None: the bundle's provider, or ``onnxruntime`` for a model file) is the
     inference engine that the new bundle is made for.
@@ -105,9 +109,9 @@ def calibrate(
     check_target(bundle_dir)
     size = one_size(dataset)
     if model.is_dir():
-        if rotation is not None or crop is not None:
+        if (rotation, crop, origin_m) != (None, None, None):
             raise UsageError(
-                "rotation, crop: expected only with an ONNX file; a bundle states its own"
+                "rotation, crop, origin: expected only with an ONNX file; a bundle states its own"
             )
         bundle = read_bundle(model)
         split = _split_of(bundle.calibration, dataset, kind, seed, new_data)
@@ -119,8 +123,13 @@ def calibrate(
     else:
         model_bytes = _read_model(model)
         split = _new_split(dataset, kind, seed)
+        if not all(abs(value) < MAX_NUMBER for value in origin_m or ()):
+            raise UsageError(f"origin: expected metres below {MAX_NUMBER:g}, found {origin_m}")
         draft = _from_model(
-            model_bytes, dataset, split, name, rotation or "tangent_predicted", crop or "none"
+            *(model_bytes, dataset, split, name),
+            rotation or "tangent_predicted",
+            crop or "none",
+            origin_m,
         )
         candidates = _given_candidates(draft)
     if rule is None:
@@ -211,6 +220,7 @@ def _from_model(
     name: str,
     rotation: GivenRotation,
     crop: Crop,
+    origin_m: Position | None,
 ) -> Draft:
     """Return a draft for a model of which only the tensors and the data's poses are known."""
     spec = model_spec(model_bytes, _opset(model_bytes))
@@ -230,7 +240,7 @@ def _from_model(
             f"model: expected an input of at least {_LEAST_INPUT}x{_LEAST_INPUT} pixels, found "
             f"{shape[2]}x{shape[1]}"
         )
-    reference, limits, deviation = known_space(dataset.poses[split.roles["val"]])
+    reference, limits, deviation = known_space(about(dataset.poses[split.roles["val"]], origin_m))
     if rotation == "euler_zyx" or reference is None:
         reference, limits = None, _with_any_rotation(limits)
     return Draft(
@@ -257,6 +267,7 @@ def _from_model(
             units=("m", "rad"),
             limits=limits,
             standard_deviation=deviation,
+            origin_m=origin_m,
         ),
         camera=dataset.camera(),
         provenance=Provenance(

@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -229,7 +230,36 @@ def test_the_run_is_remembered_when_a_bundle_comes_back_to_its_own_data(
     assert after.calibration.n == before.calibration.n
 
 
-@pytest.mark.parametrize("given", [{"rotation": "euler_zyx"}, {"crop": "centre"}])
+@pytest.mark.usefixtures("drawn_once")
+def test_a_network_of_a_far_place_answers_about_a_given_origin(tmp_path):
+    dataset = open_dataset("synthetic:room,flights=4,frames=10,size=64x48,seed=4")
+    path, utm_m = tmp_path / "own.onnx", (5e5, 5e6, 100.0)
+    path.write_bytes(own_model(dataset, bounds=True))
+    poses = dataset.poses + np.array([*utm_m, 0.0, 0.0, 0.0, 0.0])
+    far_dataset = replace(dataset, poses=poses)
+    near = calibrate(path, dataset, tmp_path / "near", "own", kind="random")
+    far = calibrate(path, far_dataset, tmp_path / "far", "own", kind="random", origin_m=utm_m)
+    assert far.pose.origin_m == utm_m
+    for one, other in zip(near.thresholds, far.thresholds, strict=True):
+        for a, b in zip(one.q_hat, other.q_hat, strict=True):
+            assert b == (None if a is None else pytest.approx(a, abs=1e-6))
+    with Odometer.load(tmp_path / "far") as odometer:
+        estimate = odometer.step(dataset.read_image(0))
+    assert np.abs(estimate.pose.t_m - utm_m).max() < 10.0
+    again = calibrate(tmp_path / "far", far_dataset, tmp_path / "again", "own", kind="random")
+    assert again.pose.origin_m == utm_m
+    assert again.pose.limits.highest[1] < 100.0
+
+
+@pytest.mark.parametrize("origin_m", [(0.0, np.nan, 0.0), (0.0, 0.0, -1e9)])
+def test_an_origin_is_three_possible_numbers(model_file, dataset, tmp_path, origin_m):
+    with pytest.raises(UsageError, match=r"^origin: expected metres below 1e\+09, found \("):
+        calibrate(model_file, dataset, tmp_path / "b", "b", origin_m=origin_m)
+
+
+@pytest.mark.parametrize(
+    "given", [{"rotation": "euler_zyx"}, {"crop": "centre"}, {"origin_m": (0.0, 0.0, 0.0)}]
+)
 def test_options_of_a_model_file_are_refused_with_a_bundle(tiny_bundle, dataset, tmp_path, given):
     with pytest.raises(UsageError, match="expected only with an ONNX file"):
         calibrate(tiny_bundle, dataset, tmp_path / "b", "b", **given)

@@ -95,6 +95,13 @@ def calibrate(
     crop: Annotated[
         Crop | None, typer.Option(help="ONNX file: crop applied to the image; default: none.")
     ] = None,
+    origin: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="ONNX file: x y z (m) that its positions are relative to; default: 0 0 0.",
+            show_default=False,
+        ),
+    ] = None,
     new_data: Annotated[
         bool,
         typer.Option("--new-data", help="Bundle: treat a data set of the same name as unseen."),
@@ -127,6 +134,7 @@ def calibrate(
         sides=sides,
         rotation=rotation,
         crop=crop,
+        origin_m=origin,
         new_data=new_data,
         provider=provider,
     )
