@@ -152,6 +152,8 @@ def run(
     from cvo_edge.programs.run import RunSummary
     from cvo_edge.programs.run import run as run_frames
 
+    if label_delay and labels is None:
+        raise UsageError("--label-delay: expected --labels FILE with it, found no labels")
     written_as = format_of(output, format)
     _refuse_overwriting(output, source, ground_truth, bundle, public_key, camera, labels, state)
     truth = open_ground_truth(ground_truth) if ground_truth else None

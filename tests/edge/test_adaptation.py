@@ -1,5 +1,6 @@
 """Thresholds that adapt to labels: the law, its limits, refusals, and the state file."""
 
+import csv
 import math
 import re
 import shutil
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from cvo_edge import Odometer, UsageError, open_source
+from cvo_edge import Odometer, UsageError, open_source, read_records
 from cvo_edge.bundle.format import CONFIDENCES, Threshold
 from cvo_edge.engine.observation import Observation
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, SinkError
@@ -408,7 +409,16 @@ def test_the_command_gives_labels_late_and_keeps_the_state(
     again, said = run()
     assert again == [again[0]] * 6 != [[1.0] * 6] * 6
     assert "labels" not in said
+    records = list(read_records(tmp_path / "records.jsonl"))
+    assert [list(record.factor) for record in records] == again
+    run("--format", "csv", "-o", tmp_path / "records.csv")
+    lines = (tmp_path / "records.csv").read_text().splitlines()
+    header, *rows = csv.reader(line for line in lines if not line.startswith("#"))
+    assert header[-1] == "factor"
+    assert [[*map(float, row[-1].split())] for row in rows] == again
     path.write_bytes(b"{}")
     with pytest.raises(CvoError, match="found a damaged file"):
         run()
+    with pytest.raises(UsageError, match="--label-delay: expected --labels FILE with it"):
+        run("--label-delay", 4)
     assert MOST_DELAY == KEPT - 1
