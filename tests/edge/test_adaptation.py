@@ -5,6 +5,7 @@ import math
 import re
 import shutil
 from collections import deque
+from itertools import islice
 
 import msgspec
 import numpy as np
@@ -97,7 +98,7 @@ def by_the_law(scores, labelled, delay, shift=None):
     return xs
 
 
-@pytest.mark.parametrize("delay", [0, 1, 5, 40])
+@pytest.mark.parametrize("delay", [0, 5, 40])
 @pytest.mark.parametrize(("score", "shift"), [("residual", None), ("additive", 2 * (1.3 - 0.4))])
 @pytest.mark.parametrize("share", [1.0, 0.3, 0.03])
 def test_the_thresholds_follow_the_law(adapting, delay, score, shift, share):
@@ -160,12 +161,12 @@ def test_thresholds_of_classes_stay_in_their_range(make_head, bundle, score, sco
             )
 
 
-@pytest.mark.parametrize("delay", [0, 5, 100, 500])
-@pytest.mark.parametrize("gap", [1, 7, 100])
+@pytest.mark.parametrize("delay", [5, 100, 500])
+@pytest.mark.parametrize("gap", [1, 7, 60])
 def test_delay_and_gaps_do_not_run_away(adapting, delay, gap):
     generator = np.random.default_rng(gap)
-    level = np.repeat([0.0, 2.5, -2.0], 400)
-    scores = np.exp(level + 0.3 * generator.standard_normal(1200))
+    level = np.repeat([0.0, 2.5, -2.0], 250)
+    scores = np.exp(level + 0.3 * generator.standard_normal(750))
     factors, missed = play(adapting(), scores, lambda seq: seq % gap == 0, delay)
     # No more than the largest score, and what is under way: e^1.5.
     assert factors.max() < scores.max() * math.exp(1.5)
@@ -385,7 +386,7 @@ def test_covered_is_what_the_interval_of_the_frame_says(artifacts_dir, clip_dir,
     truth = open_ground_truth(clip_dir)
     folder = artifacts_dir / f"synthetic-room-{method}"
     with Odometer.load(folder, scope="joint", adapt=True) as odometer:
-        for estimate in odometer.stream([*open_source(str(clip_dir))][:8]):
+        for estimate in odometer.stream(islice(open_source(str(clip_dir)), 4)):
             assert estimate.factor is not None
             pose = truth.pose_of(estimate) if estimate.source else None
             if pose is not None:

@@ -82,7 +82,7 @@ def test_a_writer_that_leaves_half_a_state_or_an_older_one_is_found(monkeypatch)
     assert list(states.states(1).outcomes) == ["unreadable"]
     older = "lambda self, state: state.labels or w(self, state)"
     monkeypatch.setattr(states, "_PROGRAM", program.format(older))
-    assert "another state" in states.states(8).outcomes
+    assert "another state" in states.states(4).outcomes
 
 
 def test_another_pose_behind_a_damaged_image_is_found(monkeypatch):
