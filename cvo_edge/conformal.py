@@ -1,4 +1,4 @@
-"""Split conformal prediction: the rank rule, the joint score, coverage, width, interval score.
+"""Split conformal prediction: rank rules of frames and recordings, joint score, interval score.
 
 This module holds every formula that turns scores into thresholds or sets into figures.
 """
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.errors import UsageError
+from cvo_edge.vocabulary import Rule
 
 Array = NDArray[np.float64]
 
@@ -31,12 +32,13 @@ def conformal_rank(n: int, confidence: float) -> int:
     return max(1, math.ceil((n + 1) * confidence - _RANK_TOLERANCE))
 
 
-def least_draws(confidence: float) -> int:
-    """Return the least n for which k <= n, so that a threshold is finite: c / (1 - c), rounded up.
+def least_draws(confidence: float, cap: float = 1.0) -> int:
+    """Return the least n of frames or recordings for which a threshold is finite, at least 1.
 
-    ``n`` counts frames, or recordings where each of them counts once.
+    This is the least n with cap <= (1 - confidence) (n + 1). The default is for frames, whose rank
+    has k <= n from c / (1 - c), and for recordings that count in full.
     """
-    return math.ceil(confidence / (1.0 - confidence) - _RANK_TOLERANCE)
+    return max(1, math.ceil(cap / (1.0 - confidence) - 1.0 - _RANK_TOLERANCE))
 
 
 def conformal_quantile(scores: ArrayLike, confidence: float) -> float:
@@ -55,23 +57,43 @@ def conformal_quantile(scores: ArrayLike, confidence: float) -> float:
     return float(np.partition(values, k - 1)[k - 1])
 
 
-def hierarchical_quantile(scores: ArrayLike, sequence: ArrayLike, confidence: float) -> float:
-    """Return q_hat for a *new* sequence, from scores (n,) grouped by ``sequence`` (n,).
+def capped_quantile(scores: ArrayLike, sequence: ArrayLike, confidence: float, cap: float) -> float:
+    """Return q_hat for a *new* recording, from scores (n,) grouped by ``sequence`` (n,).
 
-    The result is the ``confidence`` quantile of
-    sum_g sum_i delta(s_gi) / ((G + 1) n_g) + delta(inf) / (G + 1)
-    (Lee, Barber and Willett 2023, arXiv 2306.06342): sequences are exchangeable, frames within one
-    need not be. It is finite only if G / (G + 1) >= confidence (G >= 9 at 0.9).
+    With L_g(q) the share of recording g's frames whose score exceeds q, and alpha = 1 - confidence,
+    the result is the least score q with (sum_g L_g(q) + cap) / (G + 1) <= alpha, or infinity if
+    there is none. Recordings are exchangeable; frames within one need not be. Then
 
-    Raises UsageError for NaN scores.
+        E min(L_new(q_hat), cap) <= alpha,   E L_new(q_hat) <= alpha + (1 - cap) / (G + 1).
+
+    The first is conformal risk control (Angelopoulos et al. 2022, arXiv 2208.02814, theorem 1) of
+    the loss min(L, cap) with recordings as draws. At ``cap`` 1 it is hierarchical conformal
+    prediction (Lee, Barber and Willett 2023, arXiv 2306.06342). It is finite if and only if
+    cap <= alpha (G + 1): at 0.9, 9 recordings for a cap of 1 and 4 for 0.5.
+
+    Raises UsageError for NaN scores and for a cap outside (0, 1].
     """
     values = _checked(scores)
+    if not 0.0 < cap <= 1.0:
+        raise UsageError(f"cap: expected a number above 0 and at most 1, found {cap}")
     _, group, sizes = np.unique(np.asarray(sequence), return_inverse=True, return_counts=True)
+    # L_g is not clipped at the cap in the sum, although the first statement would allow that. Only
+    # the full sum proves the second one, and clipped sums hide the worst recordings: with 11, one
+    # in seven ten times as bad, and a cap of .25, plain coverage at 0.9 fell from .89 to .83.
     weights = 1.0 / ((sizes.size + 1) * sizes[group])
     order = np.argsort(values, kind="stable")
     cumulative = np.cumsum(weights[order])
-    index = int(np.searchsorted(cumulative, confidence - _RANK_TOLERANCE))
+    target = confidence - (1.0 - cap) / (sizes.size + 1)
+    index = int(np.searchsorted(cumulative, target - _RANK_TOLERANCE))
     return float(values[order[index]]) if index < values.size else math.inf
+
+
+def recording_cap(rule: Rule, cap: float | None) -> float | None:
+    """Return the cap of ``capped_quantile`` for a stored rule; None for a rule that counts frames.
+
+    ``hierarchical`` is a cap of 1.
+    """
+    return 1.0 if rule == "hierarchical" else cap
 
 
 class JointScale(Protocol):

@@ -18,7 +18,7 @@ Precision = Literal["fp32", "int8"]
 Provider = Literal["onnxruntime", "openvino"]
 Sides = Literal["symmetric", "asymmetric", "lower", "upper"]
 Joint = Literal["max", "bonferroni"]
-Rule = Literal["pooled", "hierarchical"]
+Rule = Literal["pooled", "capped", "hierarchical"]
 SplitKind = Literal["random", "block", "sequence"]
 
 SCOPES: tuple[Scope, ...] = get_args(Scope)

@@ -122,17 +122,30 @@ class PoseSpec(_Strict, frozen=True, omit_defaults=True):
     origin_m: Position | None = None
 
 
-class Threshold(_Strict, frozen=True):
+class LeftOut(_Strict, frozen=True):
+    """Coverage of each calibration recording by thresholds from the others, over recordings.
+
+    ``coverage`` is the mean over recordings of the share of frames inside, in the marginal scope
+    averaged over the DoF; ``standard_error`` is that mean's, from the recordings' deviation.
+    """
+
+    coverage: Annotated[float, Meta(ge=0, le=1)]
+    standard_error: Annotated[float, Meta(ge=0, le=1)]
+
+
+class Threshold(_Strict, frozen=True, omit_defaults=True):
     """q_hat for one confidence and scope; null means unbounded.
 
     With a two-sided score, ``q_hat`` belongs to the lower side and ``q_hat_upper`` to the upper
-    side. With other scores, ``q_hat_upper`` is null.
+    side. With other scores, ``q_hat_upper`` is null. ``left_out`` is null for a single recording,
+    and where the threshold without one of the recordings is unbounded.
     """
 
     confidence: Annotated[float, Meta(gt=0, le=1 - 1e-9)]
     scope: Scope
     q_hat: SixOrUnbounded
     q_hat_upper: SixOrUnbounded | None
+    left_out: LeftOut | None = None
 
 
 class SplitSpec(_Strict, frozen=True):
@@ -148,11 +161,13 @@ class SplitSpec(_Strict, frozen=True):
     sha256: Sha256
 
 
-class CalibrationSpec(_Strict, frozen=True):
+class CalibrationSpec(_Strict, frozen=True, omit_defaults=True):
     """Data and rules that the thresholds were computed with.
 
-    ``joint`` says how the joint scope combines six scores: ``max`` takes the largest one after
-    scaling them on val; ``bonferroni`` uses six thresholds, each at a sixth of the miscoverage.
+    ``rule`` says what counts as one draw; ``cap``, of the rule ``capped`` only, is the share of
+    missed frames that a recording counts at most. ``joint`` says how the joint scope combines six
+    scores: ``max`` takes the largest one after scaling them on val; ``bonferroni`` uses six
+    thresholds, each at a sixth of the miscoverage.
     """
 
     score: Text
@@ -163,6 +178,7 @@ class CalibrationSpec(_Strict, frozen=True):
     n_effective: Positive
     split: SplitSpec
     dataset: Text
+    cap: Annotated[float, Meta(gt=0, le=1)] | None = None
 
 
 class SelfTest(_Strict, frozen=True):

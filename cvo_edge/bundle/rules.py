@@ -37,6 +37,17 @@ def check_rules(calibration: Calibration) -> None:
             raise CalibrationFileError(
                 f"pose.limits: expected lowest < highest, found {low} and {high} at [{index}]"
             )
+    source = calibration.calibration
+    if (source.cap is not None) != (source.rule == "capped"):
+        raise CalibrationFileError(
+            "calibration.cap: expected a number with the rule capped and null with the others, "
+            f"found {'null' if source.cap is None else shown(source.cap)} with {source.rule}"
+        )
+    if source.n_sequences < 2 and any(entry.left_out for entry in calibration.thresholds):
+        raise CalibrationFileError(
+            "thresholds.left_out: expected null with a single calibration recording, found a "
+            "coverage"
+        )
     _check_thresholds(calibration.thresholds)
     _check_model(calibration)
     _check_images(calibration)

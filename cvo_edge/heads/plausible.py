@@ -20,7 +20,7 @@ from cvo_edge.bundle.format import (
     Threshold,
     shown,
 )
-from cvo_edge.conformal import least_draws
+from cvo_edge.conformal import least_draws, recording_cap
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads import Head
 from cvo_edge.input.view import crop_view, seen_camera
@@ -42,21 +42,26 @@ _QUATERNIONS = {"pose": slice(3, 7), "regression": slice(3, 7)}
 
 
 class Draws(NamedTuple):
-    """What a rule counts: its ``unit``, how many were ``given`` and how many a level ``needs``."""
+    """What a rule counts: its ``unit``, how many were ``given`` and how many a level ``needs``.
+
+    ``cap`` is that of ``capped_quantile``, and 1 for frames.
+    """
 
     unit: str
     given: int
+    cap: float
 
     @classmethod
     def of(cls, source: CalibrationSpec) -> Draws:
         """Return what the rule of a calibration counts."""
-        if source.rule == "pooled":
-            return cls("frames", source.n)
-        return cls("sequences", source.n_sequences)
+        cap = recording_cap(source.rule, source.cap)
+        if cap is None:
+            return cls("frames", source.n, 1.0)
+        return cls("recordings", source.n_sequences, cap)
 
     def needed(self, level: float) -> int:
         """Return the least number for which the threshold of a level is finite."""
-        return least_draws(level)
+        return least_draws(level, self.cap)
 
 
 def check_plausible(calibration: Calibration, head: Head) -> None:

@@ -12,10 +12,14 @@ from cvo_edge.bundle.format import Calibration, CalibrationSpec, ImageSpec, Posi
 from cvo_edge.camera import Camera
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.errors import CalibrationFileError
+from cvo_edge.guarantee import by_level, left_out_text, statement
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.heads.checked import checked_head
-from cvo_edge.heads.plausible import Draws, check_plausible, selftest_sets
+from cvo_edge.heads.plausible import check_plausible, selftest_sets
 from cvo_edge.pose import Chart
+
+# The confidence of the measured coverage that is shown.
+_SHOWN = 0.9
 
 
 def inspect_lines(calibration: Calibration) -> list[str]:
@@ -41,7 +45,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         *_entry(
             "calibrated",
             f"on {source.n} frames of {source.n_sequences} sequence(s) of {source.dataset}, split "
-            f"{source.split.kind} (seed {source.split.seed}), {source.rule}{_worth(source)}",
+            f"{source.split.kind} (seed {source.split.seed}), {_rule(source)}{_worth(source)}",
         ),
         *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
         *([] if calibration.images is None else _entry("images", _images(calibration.images))),
@@ -60,7 +64,8 @@ def inspect_lines(calibration: Calibration) -> list[str]:
             lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<18}" + cells)
     return [
         *lines,
-        *_unbounded(calibration, head),
+        *_proven(calibration, head),
+        *_left_out(calibration),
         *_widths(calibration, head),
         *_contradiction(calibration, head),
     ]
@@ -122,27 +127,35 @@ def _contradiction(calibration: Calibration, head: Head) -> list[str]:
     return []
 
 
-def _unbounded(calibration: Calibration, head: Head) -> list[str]:
-    """Explain unbounded thresholds: the number of frames or sequences they would need."""
+def _proven(calibration: Calibration, head: Head) -> list[str]:
+    """Say what is proven at each level, or what an unbounded one needs."""
     source = calibration.calibration
-    draws = Draws.of(source)
+    levels = by_level(
+        (entry.confidence, entry.scope, statement(source, head, entry))
+        for entry in calibration.thresholds
+    )
     lines = []
-    for entry in calibration.thresholds:
-        levels = [
-            level
-            for level, q_hat in zip(
-                head.levels(entry, source.joint), (entry.q_hat, entry.q_hat_upper), strict=False
-            )
-            if level is not None and q_hat is not None and None in q_hat
-        ]
-        if not levels:
-            continue
-        needed = draws.needed(max(levels))
-        reason = f"needs at least {needed} calibration {draws.unit}, has {draws.given}"
-        if draws.given >= needed:
-            reason = head.infinite_score
-        lines += _entry("unbounded", f"at {entry.confidence:g} {entry.scope}: {reason}")
+    for level, text in levels:
+        label = "unbounded" if text.startswith("unbounded") else "proven"
+        lines += _entry(label, f"at {level}: {text.removeprefix('unbounded; ')}")
     return lines
+
+
+def _left_out(calibration: Calibration) -> list[str]:
+    """Give the coverage of each recording by thresholds from the others, where it is stored."""
+    found = [
+        left_out_text(entry.scope, entry.left_out)
+        for entry in calibration.thresholds
+        if entry.left_out is not None and entry.confidence == _SHOWN
+    ]
+    if not found:
+        return []
+    text = f"coverage of a recording left out, at {_SHOWN:g}: {', '.join(found)}"
+    return _entry("measured", text)
+
+
+def _rule(source: CalibrationSpec) -> str:
+    return source.rule if source.cap is None else f"{source.rule} at {source.cap:g}"
 
 
 def _worth(source: CalibrationSpec) -> str:

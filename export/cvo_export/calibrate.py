@@ -34,6 +34,7 @@ from cvo_edge.heads import HEADS, Candidate
 from cvo_edge.heads.cqr import CqrParameters
 from cvo_edge.pose import about
 from cvo_edge.vocabulary import Crop, Joint, Provider, Rule, Sides, SplitKind
+from cvo_export.bundles.candidates import selected
 from cvo_export.bundles.draft import (
     CAMERA_FRAME,
     FEW_POSES_MARGIN,
@@ -47,7 +48,8 @@ from cvo_export.bundles.draft import (
     six,
     versions,
 )
-from cvo_export.bundles.thresholds import calibrated, selected
+from cvo_export.bundles.rule import chosen_rule
+from cvo_export.bundles.thresholds import calibrated
 from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.data.splits import Split, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
@@ -71,6 +73,7 @@ def calibrate(
     kind: SplitKind | None = None,
     seed: int | None = None,
     rule: Rule | None = None,
+    cap: float | None = None,
     joint: Joint = "max",
     score: str | None = None,
     sides: Sides | None = None,
@@ -132,8 +135,7 @@ def calibrate(
             origin_m,
         )
         candidates = _given_candidates(draft)
-    if rule is None:
-        rule = "hierarchical" if split.kind == "sequence" else "pooled"
+    rule, cap = chosen_rule(rule, cap, split.kind)
     own = provider or draft.model.provider
     # A solver's network recognises the place as the camera of its training shows it.
     solves = HEADS[draft.method].solves
@@ -142,6 +144,7 @@ def calibrate(
         draft,
         name=name,
         rule=rule,
+        cap=cap,
         joint=joint,
         split=split.spec(dataset),
         dataset=dataset.name,

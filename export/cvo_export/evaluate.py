@@ -7,18 +7,20 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration
+from cvo_edge.bundle.format import Calibration, LeftOut
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import GateError, UsageError
+from cvo_edge.guarantee import by_level, left_out_text
 from cvo_edge.heads import HEADS
 from cvo_edge.odometer import Odometer
-from cvo_edge.vocabulary import Rule
 from cvo_export.bundles.figures import Claim, Sets, point_error
 from cvo_export.bundles.online import Schedule, Stage, online, online_lines
+from cvo_export.bundles.rule import chosen_rule
 from cvo_export.bundles.thresholds import observe, with_thresholds
 from cvo_export.data.noise import Noise, noisy
 from cvo_export.data.splits import Split, same_split
@@ -50,7 +52,8 @@ def evaluate(
     ``noise`` degrades every frame, with the split's seed. The report then contains two sets of
     figures: with the bundle's thresholds, which come from clean frames, and with thresholds from
     the run's cal frames under the same noise (``recalibrated``). Without noise, a run that was
-    split by sequence is also evaluated with the other calibration rule (``other_rule``).
+    split by sequence is also evaluated with another calibration rule (``other_rule``): ``pooled``,
+    or ``capped`` if that is the bundle's.
 
     With a ``schedule`` of labels, the frames are also played in order, clean, with the noise
     ``then``, and clean again, and the thresholds adapt to the labels (``online``).
@@ -257,7 +260,7 @@ def _level_lines(
     ]
     if not all(level["coverage_band_exact"] for level in levels):
         lines.append(footnote)
-    return lines
+    return lines + _proven_lines(levels)
 
 
 def _sequence_lines(sequences: Mapping[str, Any]) -> list[str]:
@@ -280,5 +283,26 @@ def _recalibrated(
 
 def _by_the_other_rule(calibration: Calibration) -> Calibration:
     source = calibration.calibration
-    rule: Rule = "pooled" if source.rule == "hierarchical" else "hierarchical"
-    return replace(calibration, calibration=replace(source, rule=rule))
+    rule, cap = chosen_rule(None if source.rule == "pooled" else "pooled", None, "sequence")
+    return replace(calibration, calibration=replace(source, rule=rule, cap=cap))
+
+
+def _proven_lines(levels: list[dict[str, Any]]) -> list[str]:
+    """Say what is proven at each level, and what was measured on the calibration recordings.
+
+    Nothing for thresholds that make no claim about these frames.
+    """
+    stated = [
+        (level["confidence"], level["scope"], level["statement"])
+        for level in levels
+        if level["statement"] is not None
+    ]
+    found = [
+        left_out_text(level["scope"], msgspec.convert(level["left_out"], LeftOut))
+        for level in levels
+        if level["confidence"] == 0.9 and level["left_out"] is not None
+    ]
+    measured = [f"coverage of a calibration recording left out, at 0.9: {', '.join(found)}"]
+    return [f"at {level}: {text}" for level, text in by_level(stated)] + (
+        measured if stated and found else []
+    )

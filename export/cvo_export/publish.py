@@ -16,6 +16,7 @@ from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
 from cvo_edge.input import preprocess
 from cvo_edge.vocabulary import Joint, Precision, Provider, Rule, Sides
+from cvo_export.bundles.candidates import selected
 from cvo_export.bundles.draft import (
     CAMERA_FRAME,
     WORLD_FRAME,
@@ -26,7 +27,8 @@ from cvo_export.bundles.draft import (
     six,
     versions,
 )
-from cvo_export.bundles.thresholds import calibrated, selected
+from cvo_export.bundles.rule import chosen_rule
+from cvo_export.bundles.thresholds import calibrated
 from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.datasets.sizes import one_size
 from cvo_export.graph.quantise import quantised
@@ -47,6 +49,7 @@ def publish(
     name: str,
     *,
     rule: Rule | None = None,
+    cap: float | None = None,
     joint: Joint = "max",
     score: str | None = None,
     sides: Sides | None = None,
@@ -55,9 +58,9 @@ def publish(
 ) -> Calibration:
     """Export and calibrate a finished run, write its bundle and return the calibration.
 
-    ``rule`` None means ``hierarchical`` for a run split by sequence and ``pooled`` otherwise;
-    ``score`` None chooses the score on the val frames. ``int8`` quantises the backbone before
-    calibration. Scores and thresholds always come from the exported graph, run by ``provider``.
+    ``rule`` and ``cap`` None mean the default of the run's split (see ``chosen_rule``); ``score``
+    None chooses the score on the val frames. ``int8`` quantises the backbone before calibration.
+    Scores and thresholds always come from the exported graph, run by ``provider``.
 
     Raises
     ------
@@ -66,7 +69,7 @@ def publish(
     SinkError
         The folder cannot be written, or contains files that do not belong to a bundle.
     UsageError
-        The method does not have the requested score or sides.
+        The method does not have the requested score or sides, or the rule the cap.
     SourceError
         The images of the data set have several sizes.
     ModelError
@@ -75,10 +78,9 @@ def publish(
     check_target(bundle_dir)
     one_size(run.dataset)
     candidates = selected(run.graph.head.candidates(), score, sides)
-    if rule is None:
-        rule = "hierarchical" if run.split.kind == "sequence" else "pooled"
+    rule, cap = chosen_rule(rule, cap, run.split.kind)
     model_bytes, parity = _export(run, precision)
-    draft = _draft(run, model_bytes, name, rule, joint, parity, provider)
+    draft = _draft(run, model_bytes, name, (rule, cap), joint, parity, provider)
     calibration = calibrated(draft, model_bytes, run.dataset, run.split.roles, candidates)
     return write_bundle(bundle_dir, calibration, model_bytes)
 
@@ -152,7 +154,7 @@ def _draft(
     run: Run,
     model_bytes: bytes,
     name: str,
-    rule: Rule,
+    rule: tuple[Rule, float | None],
     joint: Joint,
     parity: float,
     provider: Provider,
@@ -208,7 +210,8 @@ def _draft(
             },
         ),
         camera=run.dataset.camera(),
-        rule=rule,
+        rule=rule[0],
+        cap=rule[1],
         joint=joint,
         split=run.split.spec(run.dataset),
         dataset=run.dataset.name,

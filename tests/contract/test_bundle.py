@@ -109,6 +109,21 @@ REFUSED = [
     (("calibration", "n"), 0, "calibration.n"),
     (("calibration", "n"), -5, "calibration.n"),
     (("calibration", "rule"), "best", "calibration.rule"),
+    (
+        ("calibration", "rule"),
+        "capped",
+        "calibration.cap: expected a number with the rule capped and null with the others, found "
+        "null with capped",
+    ),
+    (
+        ("calibration", "cap"),
+        0.5,
+        "calibration.cap: expected a number with the rule capped and null with the others, found "
+        "0.5 with hierarchical",
+    ),
+    (("calibration", "cap"), 1.5, "calibration.cap"),
+    (("calibration", "cap"), 0, "calibration.cap"),
+    (("thresholds", 0, "left_out"), {"coverage": 1.1, "standard_error": 0}, "left_out.coverage"),
     (("calibration", "n"), 10**19, "calibration.n"),
     (("selftest", "tolerance"), -1.0, "selftest.tolerance"),
     (("selftest", "tolerance"), 1e300, "selftest.tolerance"),

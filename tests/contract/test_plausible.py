@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from cvo_edge import CalibrationFileError
 from cvo_edge.bundle.format import CONFIDENCES
 from cvo_edge.bundle.reading import decode_calibration, encode_calibration, read_calibration
-from cvo_edge.conformal import conformal_quantile, hierarchical_quantile
+from cvo_edge.conformal import capped_quantile, conformal_quantile
 from cvo_edge.heads.checked import checked_head
 from cvo_edge.heads.cqr import CqrHead, CqrParameters
 from cvo_edge.heads.plausible import Draws, check_plausible
@@ -204,14 +204,14 @@ LIES = {
     "a finite level from nowhere": (
         "cjp",
         at(0.99, "marginal", (1e3,) * 6),
-        "thresholds.q_hat: expected null at 0.99 marginal, which needs 99 sequences, found numbers "
-        "from 20 sequences",
+        "thresholds.q_hat: expected null at 0.99 marginal, which needs 99 recordings, found "
+        "numbers from 20 recordings",
     ),
     "recordings inflated": (
         "cjp",
         counted(n_sequences=500),
-        "thresholds.q_hat: expected numbers at 0.99 marginal, for which 99 sequences suffice, "
-        "found null with 500 sequences",
+        "thresholds.q_hat: expected numbers at 0.99 marginal, for which 99 recordings suffice, "
+        "found null with 500 recordings",
     ),
     "frames inflated, and counted as draws": (
         "cjp",
@@ -221,7 +221,7 @@ LIES = {
     "fewer recordings than the level needs": (
         "scr",
         counted(n_sequences=3),
-        "expected null at 0.8 marginal, which needs 4 sequences, found numbers from 3 sequences",
+        "expected null at 0.8 marginal, which needs 4 recordings, found numbers from 3 recordings",
     ),
     "more recordings than frames": (
         "cqr",
@@ -236,7 +236,7 @@ LIES = {
     "unbounded although the counts suffice": (
         "cjp",
         null_everywhere,
-        "expected numbers at 0.5 marginal, for which 1 sequences suffice, found null with 20",
+        "expected numbers at 0.5 marginal, for which 1 recordings suffice, found null with 20",
     ),
     "a self-test that nothing fails": (
         "cjp",
@@ -350,11 +350,12 @@ def test_the_counts_tell_which_thresholds_the_rules_make_finite(artifacts_dir, s
     level = data.draw(st.sampled_from((*CONFIDENCES, 0.975, 1 - 0.1 / 6, 1 - 0.5 / 12)))
     source = honest(artifacts_dir, "cjp").calibration
     source = replace(source, n=len(sequence), n_sequences=len(sizes))
-    for rule, q_hat in (
-        ("pooled", conformal_quantile(scores, level)),
-        ("hierarchical", hierarchical_quantile(scores, sequence, level)),
+    for rule, cap, q_hat in (
+        ("pooled", None, conformal_quantile(scores, level)),
+        ("capped", 0.5, capped_quantile(scores, sequence, level, 0.5)),
+        ("hierarchical", None, capped_quantile(scores, sequence, level, 1.0)),
     ):
-        draws = Draws.of(replace(source, rule=rule))
+        draws = Draws.of(replace(source, rule=rule, cap=cap))
         assert (draws.given >= draws.needed(level)) == (q_hat < float("inf"))
 
 

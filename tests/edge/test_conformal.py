@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from cvo_edge.conformal import (
     LinearScale,
     RankScale,
+    capped_quantile,
     conformal_quantile,
     conformal_rank,
     effective_sample_size,
-    hierarchical_quantile,
     interval_score,
     least_draws,
 )
@@ -50,25 +50,106 @@ def test_threshold_grows_with_the_confidence(values):
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40, unique=True))
-def test_sequences_of_one_frame_make_the_hierarchical_rule_the_pooled_one(values):
+def test_recordings_of_one_frame_with_a_cap_of_1_make_the_pooled_rule(values):
     for confidence in (0.5, 0.8, 0.9):
-        assert hierarchical_quantile(values, range(len(values)), confidence) == (
+        assert capped_quantile(values, range(len(values)), confidence, 1.0) == (
             conformal_quantile(values, confidence)
         )
 
 
-@pytest.mark.parametrize(("sequences", "bounded"), [(8, False), (9, True), (18, True)])
-def test_hierarchical_needs_nine_sequences_at_ninety_percent(sequences, bounded):
-    values = np.arange(sequences * 5.0)
-    found = hierarchical_quantile(values, np.repeat(np.arange(sequences), 5), 0.9)
-    assert math.isfinite(found) is bounded
+# Percents, so that definitions can be checked in whole numbers.
+CONFIDENCES, CAPS = (50, 80, 90, 95, 99), (1, 5, 25, 50, 77, 100)
+# A common multiple of the numbers of frames below.
+PARTS = 840
 
 
-def test_hierarchical_weighs_sequences_not_frames():
+@pytest.fixture(scope="module")
+def groups():
+    """Scores, recordings and a confidence and cap in percent, drawn 1000 times; every second has
+    ties."""
+    generator = np.random.default_rng(0)
+    drawn = []
+    for trial in range(1000):
+        sizes = generator.integers(1, 9, generator.integers(1, 22))
+        values = 3.0 * generator.standard_normal(sizes.sum())
+        if trial % 2:
+            values = np.round(values)
+        sequence = generator.permutation(np.repeat(np.arange(sizes.size), sizes))
+        drawn.append(
+            (values, sequence, *map(int, (generator.choice(CONFIDENCES), generator.choice(CAPS))))
+        )
+    return drawn
+
+
+def by_definition(values, sequence, confidence, cap):
+    """The least score with (sum_g L_g + cap) / (G + 1) <= alpha, by counting in whole numbers."""
+    numbers, sizes = np.unique(sequence, return_counts=True)
+    candidates = np.unique(values)
+    above = values > candidates[:, None]
+    missed = sum(
+        above[:, sequence == number].sum(axis=1) * (PARTS // size)
+        for number, size in zip(numbers, sizes, strict=True)
+    )
+    within = 100 * missed + cap * PARTS <= (100 - confidence) * (sizes.size + 1) * PARTS
+    return candidates[np.argmax(within)] if within.any() else math.inf
+
+
+def hierarchical(values, sequence, confidence):
+    """The confidence quantile of all scores, weighted 1/((G + 1) n_g), and of 1/(G + 1) at inf."""
+    _, group, sizes = np.unique(sequence, return_inverse=True, return_counts=True)
+    weights = 1.0 / ((sizes.size + 1) * sizes[group])
+    order = np.argsort(values, kind="stable")
+    index = int(np.searchsorted(np.cumsum(weights[order]), confidence - 1e-9))
+    return float(values[order[index]]) if index < values.size else math.inf
+
+
+def test_the_capped_rule_is_its_definition(groups):
+    for values, sequence, confidence, cap in groups:
+        assert capped_quantile(values, sequence, confidence / 100, cap / 100) == by_definition(
+            values, sequence, confidence, cap
+        )
+
+
+def test_a_cap_of_1_is_hierarchical_conformal_prediction_to_the_bit(groups):
+    for values, sequence, confidence, _ in groups:
+        level = confidence / 100
+        found = capped_quantile(values, sequence, level, 1.0)
+        assert found == hierarchical(values, sequence, level)
+
+
+def test_a_larger_cap_never_lowers_the_threshold(groups):
+    changed = 0
+    for values, sequence, confidence, _ in groups:
+        level = confidence / 100
+        found = [capped_quantile(values, sequence, level, cap / 100) for cap in (1, 25, 100)]
+        assert found == sorted(found)
+        changed += found[0] < found[-1]
+    assert changed > 250
+
+
+@pytest.mark.parametrize("cap", CAPS)
+@pytest.mark.parametrize("confidence", CONFIDENCES)
+def test_capped_is_finite_exactly_if_the_cap_is_at_most_alpha_times_g_plus_1(confidence, cap):
+    for recordings in (*range(1, 12), 18, 19, 24, 48, 49, 98, 99):
+        found = capped_quantile(
+            np.arange(2.0 * recordings), np.arange(2 * recordings) // 2, confidence / 100, cap / 100
+        )
+        finite = cap <= (100 - confidence) * (recordings + 1)
+        assert math.isfinite(found) is finite
+        assert (recordings >= least_draws(confidence / 100, cap / 100)) is finite
+
+
+@pytest.mark.parametrize("cap", [0.0, -0.5, 1.01, math.nan])
+def test_a_cap_that_is_no_share_is_refused(cap):
+    with pytest.raises(UsageError, match="cap: expected a number above 0 and at most 1, found"):
+        capped_quantile([1.0], [0], 0.9, cap)
+
+
+def test_recordings_weigh_the_same_whatever_their_length():
     # One long sequence of small scores must not dominate nine short ones of large scores.
     values = np.concatenate([np.zeros(1000), np.ones(9)])
     sequence = np.concatenate([np.zeros(1000), np.arange(1, 10)])
-    assert hierarchical_quantile(values, sequence, 0.8) == 1.0
+    assert capped_quantile(values, sequence, 0.8, 1.0) == 1.0
     assert conformal_quantile(values, 0.8) == 0.0
 
 
@@ -82,7 +163,7 @@ def test_nan_scores_are_refused():
     with pytest.raises(UsageError, match="1 NaN among 3"):
         conformal_quantile([1.0, math.nan, 2.0], 0.5)
     with pytest.raises(UsageError, match="NaN"):
-        hierarchical_quantile([math.nan], [0], 0.5)
+        capped_quantile([math.nan], [0], 0.5, 1.0)
 
 
 def test_linear_scale_divides_and_goes_back():

@@ -103,8 +103,10 @@ def test_coverage_gate(report):
 
 def test_table_shows_every_level(report):
     text = "\n".join(table(report))
-    assert text.count("marginal") == 5
-    assert text.count("joint ") >= 5
+    assert text.count("marginal  ") == 5
+    assert text.count("joint  ") >= 5
+    assert text.count("of frames exchangeable with the calibration frames, ") == 4
+    assert "at 0.99 marginal and joint: unbounded; finite from 99 calibration frames, has" in text
     assert text.count("-   ") >= 2  # unbounded sets have no band
 
 
@@ -159,6 +161,17 @@ def cvo_export(*arguments):
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
+# Two of eight recordings calibrate.
+PROVEN = (
+    "at 0.5 marginal and joint: over new recordings, on average at most 50 % of frames are missed, "
+    "where a recording that misses more than half counts as half (in full: 66.7 %)",
+    "at 0.9 marginal and joint: unbounded; finite from 4 calibration recordings, has 2",
+    "at 0.9 marginal and joint: over new recordings of equal length, on average at most 40 % of "
+    "frames are missed",
+)
+MEASURED = "coverage of a calibration recording left out, at 0.9: marginal "
+
+
 def test_the_command_line_trains_publishes_and_evaluates(tmp_path):
     run, bundle = tmp_path / "run", tmp_path / "bundle"
     trained = cvo_export(
@@ -171,11 +184,19 @@ def test_the_command_line_trains_publishes_and_evaluates(tmp_path):
     assert "best        val score" in trained.stderr
     published = cvo_export("publish", run, bundle)
     assert published.returncode == 0, published.stderr
-    assert "hierarchical" in published.stdout
+    assert "(seed 0), capped at 0.5" in " ".join(published.stdout.split())
     evaluated = cvo_export("evaluate", bundle, DATASET, "--json", tmp_path / "report.json")
     assert evaluated.returncode == 0, evaluated.stderr
     assert "pooled rule" in evaluated.stdout
-    assert json.loads((tmp_path / "report.json").read_text())["other_rule"]["rule"] == "pooled"
+    found = json.loads((tmp_path / "report.json").read_text())
+    assert found["other_rule"]["rule"] == "pooled"
+    lines = evaluated.stdout.splitlines()
+    for line in PROVEN:
+        assert line in lines
+    # Without one of two recordings, only the pooled rule has a finite threshold at 0.9.
+    assert sum(line.startswith(MEASURED) for line in lines) == 1
+    assert find_level(found["levels"], 0.9, "joint")["left_out"] is None
+    assert find_level(found["levels"], 0.5, "joint")["left_out"]["standard_error"] > 0.0
 
 
 def test_a_failed_gate_is_exit_8_with_the_report_still_written(tiny_bundle):

@@ -5,9 +5,9 @@ import pytest
 
 from cvo_edge.conformal import (
     LinearScale,
+    capped_quantile,
     conformal_quantile,
     conformal_rank,
-    hierarchical_quantile,
 )
 from cvo_export.bundles.thresholds import Scored, thresholds
 
@@ -56,10 +56,25 @@ def test_hierarchical_rule_covers_new_sequences_where_pooling_does_not():
         scores = np.abs(generator.standard_normal((12, 30))) * difficulty[:, None]
         cal, group = scores[:11].ravel(), np.repeat(np.arange(11), 30)
         pooled.append(np.mean(scores[11] <= conformal_quantile(cal, 0.9)))
-        hierarchical.append(np.mean(scores[11] <= hierarchical_quantile(cal, group, 0.9)))
+        hierarchical.append(np.mean(scores[11] <= capped_quantile(cal, group, 0.9, 1.0)))
     error = np.std(hierarchical) / np.sqrt(REPEATS)
     assert np.mean(hierarchical) > 0.9 - 4.5 * error
     assert np.mean(pooled) < 0.89
+
+
+def test_capped_rule_bounds_the_capped_misses_and_the_plain_ones():
+    """One recording in seven is ten times as bad."""
+    generator = np.random.default_rng(7)
+    recordings, frames_each = 11, 20
+    worse = np.where(generator.random((REPEATS, recordings + 1, 1)) < 1 / 7, 10.0, 1.0)
+    scores = np.abs(generator.standard_normal((REPEATS, recordings + 1, frames_each))) * worse
+    group = np.repeat(np.arange(recordings), frames_each)
+    for cap in (0.25, 0.5, 1.0):
+        q_hat = [capped_quantile(cal.ravel(), group, 0.9, cap) for cal in scores[:, :-1]]
+        missed = (scores[:, -1] > np.array(q_hat)[:, None]).mean(axis=1)
+        error = missed.std() / np.sqrt(REPEATS)
+        assert np.minimum(missed, cap).mean() < 0.1 + 3 * error
+        assert missed.mean() < 0.1 + (1 - cap) / (recordings + 1) + 3 * error
 
 
 # -- through the heads: calibrated and evaluated like bundles -------------------------------------

@@ -84,8 +84,8 @@ class Draft:
     camera
         The camera that the bundle states, for a solver that of the training images; None if it is
         unknown.
-    rule, joint, split, dataset
-        How to compute the thresholds, and from which frames.
+    rule, cap, joint, split, dataset
+        How to compute the thresholds, and from which frames; ``cap`` is None but for ``capped``.
     running
         The camera of the calibration images, if it is not ``camera``.
     images
@@ -105,6 +105,7 @@ class Draft:
     dataset: str
     running: Camera | None = None
     images: ImageSpec | None = None
+    cap: float | None = None
 
     @classmethod
     def of(cls, calibration: Calibration) -> Draft:
@@ -119,6 +120,7 @@ class Draft:
             provenance=calibration.provenance,
             camera=calibration.camera,
             rule=source.rule,
+            cap=source.cap,
             joint=source.joint,
             split=source.split,
             dataset=source.dataset,
@@ -167,6 +169,7 @@ class Draft:
                 score=head.score,
                 joint=self.joint,
                 rule=self.rule,
+                cap=self.cap,
                 n=counts.frames,
                 n_sequences=counts.sequences,
                 n_effective=counts.effective,

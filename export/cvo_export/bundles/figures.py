@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import betabinom, spearmanr
@@ -13,6 +14,7 @@ from scipy.stats import betabinom, spearmanr
 from cvo_edge import geometry
 from cvo_edge.bundle.format import Calibration, Threshold
 from cvo_edge.conformal import conformal_rank, interval_score
+from cvo_edge.guarantee import statement
 from cvo_edge.odometer import Odometer
 from cvo_edge.sets import ConformalSet
 from cvo_export.bundles.thresholds import Observed, effective_frames, workspace
@@ -167,6 +169,10 @@ class Sets:
             if banded
             else None,
             "coverage_band_exact": self.claim == "exact",
+            "statement": None
+            if self.claim == "none"
+            else statement(self.calibration.calibration, self.odometer.head, entry),
+            "left_out": msgspec.to_builtins(entry.left_out),
             "joint_coverage": self.covered_jointly(sets),
             **self.widths(limited, alpha),
             "unbounded_share": float(1.0 - bounded.mean()),

@@ -10,18 +10,28 @@ import dataclasses
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import CONFIDENCES, Calibration, PoseSpec, SixOrUnbounded, Threshold
+from cvo_edge.bundle.format import (
+    CONFIDENCES,
+    Calibration,
+    LeftOut,
+    PoseSpec,
+    SixOrUnbounded,
+    Threshold,
+)
 from cvo_edge.conformal import (
+    capped_quantile,
     conformal_quantile,
     effective_sample_size,
-    hierarchical_quantile,
     interval_score,
+    recording_cap,
 )
 from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.errors import SourceError, UsageError
@@ -31,8 +41,9 @@ from cvo_edge.odometer import Odometer
 from cvo_edge.pose import about
 from cvo_edge.programs.selftest import observe_selftest
 from cvo_edge.sets import ConformalSet
-from cvo_edge.vocabulary import SCOPES, Joint, Rule, Scope, Sides
+from cvo_edge.vocabulary import SCOPES, Joint, Rule, Scope
 from cvo_export.bundles.draft import SELFTEST_SIZE, Counts, Draft, images_of
+from cvo_export.bundles.rule import left_out
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
@@ -207,7 +218,7 @@ def calibrated(
         for spec in draft.model.outputs
     }
     scored = cal.scored(head)
-    found = thresholds(head, scored, val.scored(head), draft.rule, draft.joint)
+    found = thresholds(head, scored, val.scored(head), draft.rule, draft.joint, draft.cap)
     return draft.calibrated(head, found, counts(scored), selftest)
 
 
@@ -232,7 +243,9 @@ def with_thresholds(
     found = counts(scored)
     return replace(
         calibration,
-        thresholds=thresholds(head, scored, val.scored(head), source.rule, source.joint),
+        thresholds=thresholds(
+            head, scored, val.scored(head), source.rule, source.joint, source.cap
+        ),
         calibration=replace(
             source,
             n=found.frames,
@@ -249,28 +262,6 @@ def counts(cal: Scored) -> Counts:
         sequences=len(np.unique(cal.sequence)),
         effective=round(effective_frames(cal), 1),
     )
-
-
-def selected(
-    candidates: Sequence[Candidate], score: str | None, sides: Sides | None
-) -> tuple[Candidate, ...]:
-    """Return the candidates with this score and these sides; None leaves the choice open.
-
-    Raises UsageError for a score or sides that the method does not have.
-    """
-    names = list(dict.fromkeys(candidate.score for candidate in candidates))
-    if score is not None and score not in names:
-        raise UsageError(f"score: expected one of {', '.join(names)}, found {score}")
-    kept = [c for c in candidates if score in (None, c.score)]
-    if sides is None or (sides == "symmetric" and "sides" not in _names(kept[0])):
-        return tuple(kept)
-    if any("sides" not in _names(candidate) for candidate in kept):
-        raise UsageError(f"sides: expected symmetric, this method's only choice, found {sides}")
-    return tuple(c._replace(parameters=replace(c.parameters, sides=sides)) for c in kept)
-
-
-def _names(candidate: Candidate) -> tuple[str, ...]:
-    return candidate.parameters.__struct_fields__
 
 
 def chosen(draft: Draft, val: Observed, candidates: Sequence[Candidate]) -> Candidate:
@@ -305,36 +296,41 @@ def workspace(pose: PoseSpec) -> tuple[Array, Array]:
 
 
 def thresholds(
-    head: Head, cal: Scored, val: Scored, rule: Rule, joint: Joint
+    head: Head, cal: Scored, val: Scored, rule: Rule, joint: Joint, cap: float | None = None
 ) -> tuple[Threshold, ...]:
     """Return the thresholds of both scopes at every confidence, from scores on cal.
 
-    ``pooled`` counts frames, ``hierarchical`` counts sequences; with too few of them a threshold
-    is unbounded (null). The joint scope ``max`` uses each frame's largest score, after scaling
-    that makes the degrees of freedom comparable on val; ``bonferroni`` uses six sets at a sixth of
-    the miscoverage each. A method with one score for all six gets the same threshold six times.
+    ``pooled`` counts frames; ``capped``, with its ``cap``, and ``hierarchical`` count recordings
+    (see ``capped_quantile``); with too few of them a threshold is unbounded (null). The joint scope
+    ``max`` uses each frame's largest score, after scaling that makes the degrees of freedom
+    comparable on val; ``bonferroni`` uses six sets at a sixth of the miscoverage each. A method
+    with one score for all six gets the same threshold six times.
     """
+    counted, used, scale = recording_cap(rule, cap), _used_sides(head), head.joint_scale(val.joint)
+    largest = scale.comparable(cal.joint)[:, used].max(axis=(1, 2))
 
-    def q_hat(scores: Array, confidence: float) -> float:
-        if rule == "hierarchical":
-            return hierarchical_quantile(scores, cal.sequence, confidence)
-        return conformal_quantile(scores, confidence)
+    def found(confidence: float, scope: Scope, rows: NDArray[np.bool_]) -> Array:
+        """Thresholds (sides, 6) from the scores of these rows (n,)."""
 
-    scale = head.joint_scale(val.joint)
-    found = []
-    for confidence in CONFIDENCES:
-        marginal = marginal_thresholds(head, cal.marginal, confidence, q_hat)
-        found.append(_threshold(confidence, "marginal", marginal))
-        if joint == "bonferroni":
-            each = 1.0 - (1.0 - confidence) / 6
-            together = marginal_thresholds(head, cal.marginal, each, q_hat)
-        else:
-            used = _used_sides(head)
-            largest = scale.comparable(cal.joint)[:, used].max(axis=(1, 2))
+        def q_hat(scores: Array, level: float) -> float:
+            if counted is None:
+                return conformal_quantile(scores, level)
+            return capped_quantile(scores, cal.sequence[rows], level, counted)
+
+        if scope == "joint" and joint == "max":
             together = np.full(cal.joint.shape[1:], np.inf)
-            together[used] = scale.thresholds(q_hat(largest, confidence))[used]
-        found.append(_threshold(confidence, "joint", together))
-    return tuple(found)
+            together[used] = scale.thresholds(q_hat(largest[rows], confidence))[used]
+            return together
+        each = confidence if scope == "marginal" else 1.0 - (1.0 - confidence) / 6
+        return marginal_thresholds(head, cal.marginal[rows], each, q_hat)
+
+    entries = []
+    for confidence, scope in product(CONFIDENCES, SCOPES):
+        at = partial(found, confidence, scope)
+        compared = cal.joint if scope == "joint" and joint == "max" else cal.marginal
+        left = left_out(compared, cal.sequence, used, scope, at)
+        entries.append(_threshold(confidence, scope, at(np.full(len(largest), True)), left))
+    return tuple(entries)
 
 
 def marginal_thresholds(
@@ -373,7 +369,9 @@ def _pooled(scores: Array, confidence: float) -> float:
     return conformal_quantile(scores, confidence)
 
 
-def _threshold(confidence: float, scope: Scope, values: Array) -> Threshold:
+def _threshold(
+    confidence: float, scope: Scope, values: Array, left: LeftOut | None = None
+) -> Threshold:
     """Convert thresholds (sides, 6), infinite where unbounded, to a stored entry."""
     sides = [_six_or_unbounded(row) for row in values]
     return Threshold(
@@ -381,6 +379,7 @@ def _threshold(confidence: float, scope: Scope, values: Array) -> Threshold:
         scope=scope,
         q_hat=sides[0],
         q_hat_upper=sides[1] if len(sides) == 2 else None,
+        left_out=left,
     )
 
 

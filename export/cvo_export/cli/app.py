@@ -71,8 +71,14 @@ TrainingSplitOption = Annotated[
 RuleOption = Annotated[
     Rule | None,
     typer.Option(
-        help="Unit of exchangeability: frame (pooled) or sequence (hierarchical); "
-        "default: hierarchical for a split by sequence, otherwise pooled."
+        help="What counts as one draw: a frame (pooled) or a recording (capped, hierarchical); "
+        "default: capped for a split by sequence, otherwise pooled."
+    ),
+]
+CapOption = Annotated[
+    float | None,
+    typer.Option(
+        help="capped: share of missed frames that a recording counts at most; default: 0.5."
     ),
 ]
 JointOption = Annotated[

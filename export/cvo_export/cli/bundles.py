@@ -10,6 +10,7 @@ import typer
 from cvo_edge.programs.options import examples
 from cvo_edge.vocabulary import Crop, Precision, Provider, SplitKind
 from cvo_export.cli.app import (
+    CapOption,
     DatasetArgument,
     JointOption,
     NameOption,
@@ -38,6 +39,7 @@ def publish(
         Provider, typer.Option(help="Engine that the bundle is calibrated for and runs on.")
     ] = "onnxruntime",
     rule: RuleOption = None,
+    cap: CapOption = None,
     joint: JointOption = "max",
     score: ScoreOption = None,
     sides: SidesOption = None,
@@ -56,6 +58,7 @@ def publish(
         bundle,
         name or bundle.resolve().name,
         rule=rule,
+        cap=cap,
         joint=joint,
         score=score,
         sides=sides,
@@ -85,6 +88,7 @@ def calibrate(
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the split; default: 0.")] = None,
     rule: RuleOption = None,
+    cap: CapOption = None,
     joint: JointOption = "max",
     score: ScoreOption = None,
     sides: SidesOption = None,
@@ -129,6 +133,7 @@ def calibrate(
         kind=split,
         seed=seed,
         rule=rule,
+        cap=cap,
         joint=joint,
         score=score,
         sides=sides,
