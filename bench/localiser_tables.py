@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from markdown_table import table
 from provenance import read_result, result_files
+
+from cvo_edge.vocabulary import Rule
 
 Report = dict[str, Any]
 
@@ -219,7 +221,7 @@ def redraws() -> str:
     for path in result_files(FOLDER):
         if path.stem.startswith("redraw-"):
             report = read_result(FOLDER, path.stem)
-            for rule in ("pooled", "hierarchical"):
+            for rule in (rule for rule in get_args(Rule) if rule in report):
                 for scope, figures in report[rule].items():
                     width = figures["mean_width"]
                     rows.append(

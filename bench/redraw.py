@@ -4,7 +4,9 @@
 
 The network, val and the self-check stay fixed. In each deal as many recordings as the bundle was
 calibrated on are drawn from those of cal and test; the others are tested. Figures are means over
-all deals at 0.9: coverage per degree of freedom, joint coverage, width and interval score.
+all deals at 0.9: coverage per degree of freedom, joint coverage, width and interval score; and the
+median over all deals of the median width over that of the pooled rule (``over_pooled``, mean over
+the degrees of freedom). The rule ``capped`` has its default cap.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from cvo_edge.errors import UsageError
 from cvo_edge.heads import Head
 from cvo_edge.odometer import Odometer
 from cvo_edge.vocabulary import Rule
+from cvo_export.bundles.rule import DEFAULT_CAP
 from cvo_export.bundles.thresholds import Observed, Scored, observe, thresholds
 from cvo_export.data.splits import same_split
 from cvo_export.datasets import open_dataset
@@ -36,9 +39,10 @@ RULES: tuple[Rule, ...] = get_args(Rule)
 def deal_figures(
     head: Head, cal: Scored, test: Observed, val: Scored, rule: Rule, unit: Array
 ) -> dict[str, Array]:
-    """Return the figures of one deal by scope; empty if a threshold is unbounded."""
+    """Return the figures of one deal by scope; none for a scope with an unbounded threshold."""
     found: dict[str, Array] = {}
-    for entry in thresholds(head, cal, val, rule, "max"):
+    cap = DEFAULT_CAP if rule == "capped" else None
+    for entry in thresholds(head, cal, val, rule, "max", cap):
         if entry.confidence != CONFIDENCE or None in entry.q_hat:
             continue
         sets = test.sets(head, entry)
@@ -48,13 +52,18 @@ def deal_figures(
         distance = np.array([each.distance(y) for each, y in zip(sets, test.truth, strict=True)])
         score = interval_score(width, distance, 1.0 - CONFIDENCE) / unit
         found[entry.scope] = np.concatenate(
-            [covered.mean(axis=0), width.mean(axis=0), [np.mean(inside), score.mean()]]
+            [
+                covered.mean(axis=0),
+                width.mean(axis=0),
+                [np.mean(inside), score.mean()],
+                np.median(width, axis=0),
+            ]
         )
     return found
 
 
 def main() -> None:
-    """Print the figures of both rules; write them as JSON where asked."""
+    """Print the figures of all rules; write them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("bundle", type=Path)
     parser.add_argument("dataset")
@@ -82,23 +91,27 @@ def main() -> None:
     for _ in range(arguments.deals):
         drawn = np.isin(seen.sequence, generator.permutation(recordings)[:count])
         cal, test = seen.where(drawn).scored(head), seen.where(~drawn)
-        for rule in RULES:
-            for scope, values in deal_figures(head, cal, test, val, rule, unit).items():
-                collected.setdefault((rule, scope), []).append(values)
+        dealt = {rule: deal_figures(head, cal, test, val, rule, unit) for rule in RULES}
+        for rule, scopes in dealt.items():
+            for scope, values in scopes.items():
+                over = np.mean(values[14:] / dealt["pooled"][scope][14:])
+                collected.setdefault((rule, scope), []).append(np.append(values[:14], over))
     figures: dict[str, Any] = {}
     print(f"{arguments.deals} deals: {count} of {len(recordings)} recordings calibrate")
     for (rule, scope), values in collected.items():
-        mean = np.mean(values, axis=0)
+        mean, over = np.mean(values, axis=0), float(np.median(np.array(values)[:, 14]))
         figures.setdefault(rule, {})[scope] = {
             "coverage": mean[:6].tolist(),
             "mean_width": mean[6:12].tolist(),
             "joint_coverage": float(mean[12]),
             "normalised_interval_score": float(mean[13]),
+            "over_pooled": over,
         }
         print(
             f"{rule:<13} {scope:<9} coverage {mean[:6].mean():.3f} (least {mean[:6].min():.3f}), "
             f"joint {mean[12]:.3f}, width {100 * mean[6:9].mean():.2f} cm "
-            f"{np.rad2deg(mean[9:12].mean()):.2f} deg, score {mean[13]:.3f}"
+            f"{np.rad2deg(mean[9:12].mean()):.2f} deg, score {mean[13]:.3f}, "
+            f"width over pooled {over:.3f}"
         )
     if arguments.json:
         report = {"bundle": calibration.name, "deals": arguments.deals, "recordings": count}

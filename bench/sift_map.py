@@ -23,7 +23,7 @@ from provenance import write_result
 
 from cvo_edge import geometry
 from cvo_edge.camera import Camera
-from cvo_edge.conformal import conformal_quantile, hierarchical_quantile, interval_score
+from cvo_edge.conformal import capped_quantile, conformal_quantile, interval_score
 from cvo_edge.errors import SourceError
 from cvo_edge.pose import Chart
 from cvo_edge.pose_solver import PoseSolver
@@ -115,7 +115,7 @@ def figures(
     # Without a pose the set is everything: the truth is inside, at no threshold.
     scores = np.where(np.isfinite(cal.deviation), np.abs(cal.error) / cal.deviation, 0.0)
     if rule == "hierarchical":
-        q_hat = [hierarchical_quantile(s, cal.sequence, CONFIDENCE) for s in scores.T]
+        q_hat = [capped_quantile(s, cal.sequence, CONFIDENCE, 1.0) for s in scores.T]
     else:
         q_hat = [conformal_quantile(s, CONFIDENCE) for s in scores.T]
     half = np.minimum(np.array(q_hat) * test.deviation, 0.5 * workspace)
