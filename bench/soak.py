@@ -45,7 +45,9 @@ class Cycled:
         self.length = length
         clip = list(open_source(str(CLIP)))
         black = np.zeros_like(clip[0].image)
-        self._frames = [*clip, replace(clip[0], image=black), replace(clip[0], image=None)]
+        frames = [*clip, replace(clip[0], image=black), replace(clip[0], image=None)]
+        # The clip comes again and again, which is no fault here.
+        self._frames = [replace(frame, fresh_noise=False, moving=False) for frame in frames]
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames."""

@@ -24,6 +24,8 @@ NOTHING = "Not measured yet."
 WORST, OVER = 10, 0.15
 
 Report = dict[str, Any]
+# The result of bench/temporal.py, which needs no bundle.
+TEMPORAL = "temporal"
 # Bundle -> state -> reports of all seeds.
 Found = dict[str, dict[str, list[Report]]]
 
@@ -32,6 +34,8 @@ def reports(program: str) -> Found:
     """Return the results of one program."""
     found: Found = defaultdict(lambda: defaultdict(list))
     for path in result_files(FOLDER):
+        if path.stem == TEMPORAL:
+            continue
         match = NAME.fullmatch(path.stem)
         if match is None:
             raise KeyError(f"{path.name}: expected a name of the form STATE-PROGRAM-BUNDLE")

@@ -51,6 +51,7 @@ class Reason(StrEnum):
     IMAGE_GREY = "image_grey"  # degraded: no colour, unlike the calibration images
     IMAGE_UNFAMILIAR = "image_unfamiliar"  # degraded: does not show the place the network knows
     FRAME_REPEATED = "frame_repeated"  # degraded: the same image came before; it may be frozen
+    PICTURE_STILL = "picture_still"  # degraded: the camera moves, as stated, but not its picture
     FRAME_STALE = "frame_stale"  # degraded: the frame waited for more than a second
     STAMP_NOT_LATER = "stamp_not_later"  # degraded: not later than the previous frame's stamp
     BOUNDS_CROSSED = (

@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Lock
 from time import perf_counter
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,31 +27,15 @@ from cvo_edge.estimate import PoseInterval, Reason, Status
 from cvo_edge.input.clock import SYSTEM_CLOCK
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.frame_checks import StreamChecks
-from cvo_edge.monitor.adaptation import Adaptation, Level
+from cvo_edge.monitor.adaptation import Adaptation
 from cvo_edge.monitor.labelled import Labelled
 from cvo_edge.pose import Pose
+from cvo_edge.processed import Processed
 from cvo_edge.scheduling import checked_mode, plan, run_stream
 from cvo_edge.sets import ConformalSet, unbounded_set
 from cvo_edge.vocabulary import Scope
 
 _STEEP_PITCH = np.deg2rad(80.0)
-
-
-class Processed(NamedTuple):
-    """One frame before its stream checks: the result of a worker and the input of ``conclude``.
-
-    ``conformal_set`` is unbounded if the observation has a fault or a doubt. ``conformal_ms`` is
-    the time for the set, ``total_ms`` the time from reading the frame to the set, ``level`` the
-    thresholds of the set if the odometer adapts.
-    """
-
-    frame: Frame
-    seq: int
-    observation: Observation
-    conformal_set: ConformalSet
-    conformal_ms: float
-    total_ms: float
-    level: Level | None = None
 
 
 class Odometer(Labelled):
@@ -229,6 +213,9 @@ class Odometer(Labelled):
         stamp_ns: int | None = None,
         source: str = "",
         read_ms: float = 0.0,
+        *,
+        moving: bool | None = None,
+        fresh_noise: bool = True,
     ) -> PoseInterval:
         """Estimate the camera pose of one image and the set that holds it.
 
@@ -245,6 +232,12 @@ class Odometer(Labelled):
             Name of the image; copied to the result.
         read_ms
             Time it took to read the image, for the record's latencies.
+        moving
+            Whether the camera moves, by other sensors or its commands, if that is known: a picture
+            that stands still while the camera moves is a doubt.
+        fresh_noise
+            False for images decoded from a video codec that predicts pictures from others (H.264),
+            and for simulated ones without noise: equal parts of two images then prove nothing.
 
         Raises
         ------
@@ -257,12 +250,14 @@ class Odometer(Labelled):
             stamp_ns = None if stamp_ns is None else index(stamp_ns)
         except TypeError:
             raise UsageError(f"stamp_ns: expected an int or None, found {stamp_ns!r}") from None
-        frame = Frame(image_bgr, stamp_ns, source, read_ms)
+        frame = Frame(image_bgr, stamp_ns, source, read_ms, fresh_noise=fresh_noise, moving=moving)
         # Stream checks compare consecutive frames, so threads must not interleave.
         with self._stepping:
             return self.conclude(self._process(frame, self._seq))
 
-    def stream(self, frames: Iterable[Frame | NDArray[Any]]) -> Generator[PoseInterval, None, None]:
+    def stream(
+        self, frames: Iterable[Frame | NDArray[Any]], *, moving: bool | None = None
+    ) -> Generator[PoseInterval, None, None]:
         """Yield estimates for a source, for frames or for BGR images, lazily and in order.
 
         The mode decides how frames are processed (see ``cvo_edge.scheduling``). In ``throughput``
@@ -270,6 +265,7 @@ class Odometer(Labelled):
         a camera in every mode, only the newest frame is used; ``seq`` skips the numbers of dropped
         frames. ``live`` mode plays a recording by its stamps; any other iterable sets its own pace.
         The stream checks start again. You may overwrite an image after requesting the next one.
+        ``moving`` is as for ``step``, for the frames that do not say it themselves.
 
         Raises the source's errors; raises UsageError for a path instead of a source and, in
         ``live`` mode, for a recording without stamps.
@@ -288,7 +284,7 @@ class Odometer(Labelled):
             )
         ) as stream:
             for processed in stream:
-                yield self.conclude(processed)
+                yield self.conclude(processed.told(moving))
 
     def _process(self, frame: Frame, seq: int) -> Processed:
         """Process a frame as far as it does not depend on earlier frames; thread-safe."""
@@ -316,7 +312,9 @@ class Odometer(Labelled):
         # The age counts until the estimate is given: a process may be stopped at any point.
         age_ms = frame.age_ms(self._clock.now_s())
         doubts += self._sizes.doubts(observation.look)
-        doubts += self._stream_checks.doubts(observation.look, frame.stamp_ns, age_ms)
+        doubts += self._stream_checks.doubts(
+            observation.look, frame.stamp_ns, age_ms, frame.fresh_noise, frame.moving
+        )
         if self._camera_differs(observation, doubts):
             doubts += (Reason.CAMERA_DIFFERS,)
         if doubts:
@@ -339,13 +337,7 @@ class Odometer(Labelled):
             confidence=self.confidence,
             scope=self.scope,
             chart=self.chart,
-            latency_ms={
-                "read": round(frame.read_ms, 4),
-                "preprocess": round(observation.preprocess_ms, 4),
-                "model": round(observation.model_ms, 4),
-                "conformal": round(processed.conformal_ms, 4),
-                "total": round(processed.total_ms, 4),
-            },
+            latency_ms=processed.latency_ms(),
             factor=None if level is None else level.factor,
         )
 
@@ -362,6 +354,11 @@ class Odometer(Labelled):
         None if the method cannot tell, for fewer than 20 frames, or if no camera explains them.
         """
         return None if self._camera_check is None else self._camera_check.estimate()
+
+    @property
+    def unproven_frames(self) -> int:
+        """Frames of the stream without fresh noise, whose equal parts prove no repetition."""
+        return self._stream_checks.unproven
 
     def _remarks(self, observation: Observation, found: ConformalSet) -> tuple[Reason, ...]:
         remarks: tuple[Reason, ...] = ()

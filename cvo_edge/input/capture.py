@@ -38,6 +38,15 @@ _RELEASE_S = 1.0
 
 # FFmpeg's decoders that draw characters: a pipe or an address may give a text, too.
 _DRAWN = frozenset(int.from_bytes(name, "little") for name in (b"ansi", b"xbin"))
+# FFmpeg's names of codecs that code every picture by itself.
+_INTRA = frozenset(
+    int.from_bytes(name, "little")
+    for name in (
+        b"\0\0\0\0",  # pictures that are not coded
+        *(b"MJPG", b"mjpg", b"jpeg", b"mjp2", b"MPNG", b"png ", b"FFV1", b"ffv1", b"HFYU", b"FFVH"),
+        *(b"AVdn", b"apch", b"apcn", b"apcs", b"apco", b"ap4h", b"ap4x"),
+    )
+)
 
 T = TypeVar("T")
 
@@ -58,6 +67,7 @@ class Grabbed:
     from then on; ``read_ms`` also includes the wait for the frame. ``queued_ms`` bounds the age of
     the frame at its arrival: the time it may have spent in a camera's queue. ``position_ms`` is the
     frame's time in a file's container; some builds of OpenCV count from the end of the first frame.
+    ``fresh_noise`` is False behind a codec that predicts pictures from others.
     """
 
     image: NDArray[Any]
@@ -67,6 +77,7 @@ class Grabbed:
     decode_ms: float
     read_ms: float
     queued_ms: float
+    fresh_noise: bool = True
 
 
 class Reader(Protocol):
@@ -209,6 +220,7 @@ class _Opened:
         self._capture, self._clock = capture, clock
         self._account = LagAccount(clock.now_s(), 0.0)
         self._driver: DriverStamps | None = None
+        self._fresh_noise = True
 
     def open(self, device: int | str) -> _Stated | None:
         """Open the device; return what it states of itself, None if it does not open."""
@@ -226,6 +238,7 @@ class _Opened:
         self._account = LagAccount(begin, fps)
         # Video4Linux reports the driver's stamp as the position; other backends count from a start.
         self._driver = DriverStamps() if backend == "V4L2" else None
+        self._fresh_noise = backend != "FFMPEG" or codec in _INTRA
         return _Stated(fps, int(count) if 0.0 < count < math.inf else 0, codec)
 
     def grab(self) -> Grabbed | None:
@@ -257,6 +270,7 @@ class _Opened:
             decode_ms=1e3 * (end - arrived),
             read_ms=1e3 * (end - begin),
             queued_ms=1e3 * queued_s,
+            fresh_noise=self._fresh_noise,
         )
 
     def release(self) -> None:

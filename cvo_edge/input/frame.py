@@ -20,6 +20,10 @@ class Frame:
     a camera's queue. ``arrived_s`` is the time of arrival on ``Clock.now_s``, None if the frame
     does not age (files, frames of a caller). ``skipped`` is the number of frames of the source that
     were dropped before this one.
+
+    ``fresh_noise`` is False if equal parts of two images do not prove a copy: behind a codec that
+    predicts from other frames (H.264), and in a simulation without sensor noise. ``moving`` is what
+    the caller knows about the camera from other sensors or its commands; None is nothing.
     """
 
     image: NDArray[Any] | None
@@ -29,6 +33,8 @@ class Frame:
     queued_ms: float = 0.0
     arrived_s: float | None = None
     skipped: int = 0
+    fresh_noise: bool = True
+    moving: bool | None = None
 
     def age_ms(self, now_s: float) -> float:
         """Return an upper bound on the frame's age at ``now_s`` of ``Clock.now_s``."""

@@ -152,9 +152,11 @@ class Video:
                     unreadable += 1
                     continue
                 found = [*[(None, 0.0)] * unreadable, (grabbed.image, grabbed.read_ms)]
+                fresh = grabbed.fresh_noise
                 stamps = self._stamps.next(len(found), grabbed.position_ms)
                 for (image, read_ms), stamp_ns in zip(found, stamps, strict=True):
-                    yield Frame(image, stamp_ns, f"{shown(self._path.name)}#{seq}", read_ms)
+                    name = f"{shown(self._path.name)}#{seq}"
+                    yield Frame(image, stamp_ns, name, read_ms, fresh_noise=fresh)
                     seq += 1
                 unreadable = 0
         if self.length is not None and seq < self.length:
@@ -294,6 +296,7 @@ class Camera:
                         grabbed.decode_ms,
                         grabbed.queued_ms,
                         grabbed.arrived_s,
+                        fresh_noise=grabbed.fresh_noise,
                     )
                 )
                 return frames

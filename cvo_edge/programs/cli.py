@@ -20,6 +20,7 @@ from cvo_edge.programs.options import (
     BundleArgument,
     CacheOption,
     CameraOption,
+    ExpectMotionOption,
     GroundTruthOption,
     JsonOption,
     LabelDelayOption,
@@ -122,6 +123,7 @@ def run(
         typer.Option(help="Stamp frames at this rate, from zero.", rich_help_panel="Input"),
     ] = None,
     camera: CameraOption = None,
+    expect_motion: ExpectMotionOption = False,
     max_frames: MaxFramesOption = None,
     timeout: TimeoutOption = 5.0,
     mode: Annotated[
@@ -196,6 +198,7 @@ def run(
                         truth=truth,
                         labels=Labels(odometer, labelled, label_delay) if labelled else None,
                         max_frames=max_frames,
+                        expect_motion=expect_motion,
                         tick=tick,
                     )
             finally:

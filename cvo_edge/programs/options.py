@@ -58,6 +58,14 @@ CameraOption = Annotated[
         rich_help_panel="Input",
     ),
 ]
+ExpectMotionOption = Annotated[
+    bool,
+    typer.Option(
+        "--expect-motion",
+        help="The camera always moves: a picture that stands still is a doubt.",
+        rich_help_panel="Input",
+    ),
+]
 RegionOption = Annotated[
     bool,
     typer.Option(

@@ -35,8 +35,9 @@ class RunSummary:
     gap in some degree of freedom; ``skipped`` counts frames dropped for a newer one; ``matched``
     counts frames that have a true pose, ``compared`` those of status ok among them, and ``covered``
     those whose set holds the true value, per degree of freedom; ``camera`` is what the frames show
-    of the camera, if they do; ``left_out`` counts the images of a folder that are no frames;
-    ``labels`` are those that the thresholds have adapted to.
+    of the camera, if they do; ``left_out`` counts the images of a folder that are no frames,
+    ``unproven`` the frames whose equal parts prove no repetition; ``labels`` are those that the
+    thresholds have adapted to.
     """
 
     dof: tuple[str, ...]
@@ -57,6 +58,7 @@ class RunSummary:
     camera: LensEstimate | None = None
     left_out: Mapping[str, int] = field(default_factory=dict)
     labels: Labels | None = None
+    unproven: int = 0
     # Frames are numbered from 0, so that dropped frames at the start are counted, too.
     _last_seq: int = -1
 
@@ -96,6 +98,11 @@ class RunSummary:
         if self.reasons:
             found = ", ".join(f"{name} {count}" for name, count in sorted(self.reasons.items()))
             lines.append(f"remarks     {found}")
+        if self.unproven:
+            lines.append(
+                f"not checked {self.unproven} frames, for parts equal to earlier ones: their codec "
+                "repeats what stands still"
+            )
         if self.camera is not None:
             fx, fy, k1, frames = self.camera
             wrong = max(abs(math.log(fx)), abs(math.log(fy))) > _WORTH_A_LOOK
@@ -145,18 +152,20 @@ def run(
     truth: GroundTruth | None = None,
     labels: Labels | None = None,
     max_frames: int | None = None,
+    expect_motion: bool = False,
     tick: Callable[[], None] | None = None,
 ) -> None:
     """Estimate all ``frames``; write each estimate and count it in ``summary``.
 
-    The caller owns the summary and can show it even if the source ends early. ``tick`` is called
-    after each frame. The odometer gets the labels whose time has come after each estimate.
+    The caller owns the summary and can show it even if the source ends early. With
+    ``expect_motion``, a picture that stands still is a doubt. ``tick`` is called after each frame.
+    The odometer gets the labels whose time has come after each estimate.
     """
     if isinstance(frames, ImageFiles):
         summary.left_out = frames.left_out
     summary.labels = labels
     try:
-        with closing(odometer.stream(frames)) as estimates:
+        with closing(odometer.stream(frames, moving=expect_motion or None)) as estimates:
             for estimate in islice(estimates, max_frames):
                 write(estimate)
                 summary.add(estimate, truth.pose_of(estimate) if truth else None)
@@ -166,3 +175,4 @@ def run(
                     tick()
     finally:
         summary.camera = odometer.seen_camera
+        summary.unproven = odometer.unproven_frames
