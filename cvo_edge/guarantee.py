@@ -22,6 +22,8 @@ def statement(source: CalibrationSpec, head: Head, entry: Threshold) -> str:
     """Return what is proven about the coverage of an entry's sets.
 
     An unbounded level gets, instead, the number of frames or recordings from which it is finite.
+    With a crossed calibration, nothing is proven for the one network of the bundle; see
+    docs/guarantee.md.
     """
     sides = [
         (level, q_hat)
@@ -60,6 +62,8 @@ def left_out_text(scope: Scope, left_out: LeftOut) -> str:
 
 def _claim(source: CalibrationSpec, entry: Threshold, levels: list[float]) -> str:
     """Return the statement about bounds that were calibrated one by one at these confidences."""
+    if source.crossed is not None:
+        return "nothing is proven: the network was trained on the recordings that calibrate it"
     alpha, kind = 1.0 - entry.confidence, source.split.kind
     cap = recording_cap(source.rule, source.cap)
     if cap is None and kind == "random":

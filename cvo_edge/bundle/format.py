@@ -168,6 +168,9 @@ class CalibrationSpec(_Strict, frozen=True, omit_defaults=True):
     missed frames that a recording counts at most. ``joint`` says how the joint scope combines six
     scores: ``max`` takes the largest one after scaling them on val; ``bonferroni`` uses six
     thresholds, each at a sixth of the miscoverage.
+
+    ``crossed``: number of folds of recordings of a crossed calibration. The scores of each fold
+    come from a network trained without it; the bundle's network was trained on all of them.
     """
 
     score: Text
@@ -179,6 +182,7 @@ class CalibrationSpec(_Strict, frozen=True, omit_defaults=True):
     split: SplitSpec
     dataset: Text
     cap: Annotated[float, Meta(gt=0, le=1)] | None = None
+    crossed: Annotated[int, Meta(ge=2, le=10**9)] | None = None
 
 
 class SelfTest(_Strict, frozen=True):

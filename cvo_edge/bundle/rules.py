@@ -49,8 +49,34 @@ def check_rules(calibration: Calibration) -> None:
             "coverage"
         )
     _check_thresholds(calibration.thresholds)
+    _check_crossed(calibration)
     _check_model(calibration)
     _check_images(calibration)
+
+
+def _check_crossed(calibration: Calibration) -> None:
+    """Check that folds of recordings are possible, and that the provenance tells of them.
+
+    The provenance outlives the calibration: it keeps later ones from using the same recordings.
+    """
+    source, provenance = calibration.calibration, calibration.provenance
+    if source.crossed is None:
+        return
+    if source.crossed > source.n_sequences:
+        raise CalibrationFileError(
+            f"calibration.crossed: expected at most one fold for each of the {source.n_sequences} "
+            f"sequences, found {source.crossed}"
+        )
+    if source.split != provenance.training_split or source.split.kind != "sequence":
+        raise CalibrationFileError(
+            "calibration.crossed: expected the split by sequence that the network was trained on, "
+            f"found {shown(source.split.kind)} of {source.dataset}"
+        )
+    if provenance.options.get("folds") != source.crossed:
+        raise CalibrationFileError(
+            f"calibration.crossed: expected provenance.options.folds {source.crossed}, found "
+            f"{shown(provenance.options.get('folds'))}"
+        )
 
 
 def _check_thresholds(thresholds: tuple[Threshold, ...]) -> None:

@@ -47,6 +47,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
             f"on {source.n} frames of {source.n_sequences} sequence(s) of {source.dataset}, split "
             f"{source.split.kind} (seed {source.split.seed}), {_rule(source)}{_worth(source)}",
         ),
+        *_crossed(source),
         *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
         *([] if calibration.images is None else _entry("images", _images(calibration.images))),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
@@ -163,6 +164,17 @@ def _worth(source: CalibrationSpec) -> str:
     if source.split.kind == "random":
         return ""
     return f"; worth about {source.n_effective:.0f} independent frames"
+
+
+def _crossed(source: CalibrationSpec) -> list[str]:
+    """Say how a crossed calibration was made and what it does not prove."""
+    if source.crossed is None:
+        return []
+    return _entry(
+        "crossed",
+        f"in {source.crossed} folds: the scores of each come from a network trained without its "
+        "recordings, this network was trained on all of them: its coverage is measured, not proven",
+    )
 
 
 def doctor_lines(report: dict[str, Any]) -> list[str]:

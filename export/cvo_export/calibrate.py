@@ -185,6 +185,11 @@ def _split_of(
                 "them was used for training"
             ) from None
         return _new_split(dataset, kind, seed)
+    if "folds" in calibration.provenance.options:
+        raise UsageError(
+            "data set: expected frames that the network was not trained on, found the recordings "
+            "of its crossed calibration, which trained it; publish the run again"
+        )
     if kind is not None or seed is not None:
         raise UsageError(
             "split, seed: cannot be chosen for the data set that the bundle was trained on; "

@@ -33,6 +33,10 @@ Array = NDArray[np.float64]
 # Footnotes for coverage bands that are not exact.
 _INDICATIVE = "? indicative: frames of one recording are not independent draws"
 _NO_CLAIM = "- no band: thresholds from clean frames guarantee nothing for noisy frames"
+_CROSSED = (
+    "recalibrated: not for a crossed calibration, whose network was trained on its calibration "
+    "frames"
+)
 
 
 def evaluate(
@@ -53,7 +57,8 @@ def evaluate(
     figures: with the bundle's thresholds, which come from clean frames, and with thresholds from
     the run's cal frames under the same noise (``recalibrated``). Without noise, a run that was
     split by sequence is also evaluated with another calibration rule (``other_rule``): ``pooled``,
-    or ``capped`` if that is the bundle's.
+    or ``capped`` if that is the bundle's. A bundle with a crossed calibration has neither, because
+    its network was trained on the cal frames.
 
     With a ``schedule`` of labels, the frames are also played in order, clean, with the noise
     ``then``, and clean again, and the thresholds adapt to the labels (``online``).
@@ -124,7 +129,9 @@ def evaluate(
                 changed = Stage(str(then), indices, observe(odometer, later, indices))
                 stages = [*stages, changed, *stages]
             report["online"] = online(odometer, calibration, dataset.poses, stages, schedule)
-        if split is not None and noise is not None:
+        if split is None or calibration.calibration.crossed is not None:
+            return report
+        if noise is not None:
             again = _recalibrated(odometer, dataset, split, calibration)
             others = Sets(odometer, seen, again, claim)
             report["recalibrated"] = {
@@ -133,7 +140,7 @@ def evaluate(
                 "levels": others.levels(),
                 "sequences": others.sequences(dataset),
             }
-        elif split is not None and split.kind == "sequence":
+        elif split.kind == "sequence":
             other = _recalibrated(odometer, dataset, split, _by_the_other_rule(calibration))
             others = Sets(odometer, seen, other, claim)
             report["other_rule"] = {"rule": other.calibration.rule, "levels": others.levels()}
@@ -205,14 +212,18 @@ def table(report: Mapping[str, Any]) -> list[str]:
             lines += ["", *_level_lines(report["method"], other["rule"], other["levels"])]
         lines += _sequence_lines(report["sequences"])
         return [*lines, "", *online_lines(report["online"])] if "online" in report else lines
-    again = report["recalibrated"]
-    return [
-        *lines,
+    lines += [
         "",
         f"clean: the bundle's own thresholds, from {report['n_calibration']} frames without noise",
         *_level_lines(report["method"], report["rule"], report["levels"], _NO_CLAIM),
         *_sequence_lines(report["sequences"]),
         "",
+    ]
+    if "recalibrated" not in report:
+        return [*lines, _CROSSED]
+    again = report["recalibrated"]
+    return [
+        *lines,
         f"recalibrated: thresholds from {again['n_calibration']} calibration frames with the same "
         f"noise; {again['left_out']} left out",
         *_level_lines(report["method"], report["rule"], again["levels"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -17,6 +18,7 @@ from cvo_edge.errors import GateError
 from cvo_edge.input import preprocess
 from cvo_edge.vocabulary import Joint, Precision, Provider, Rule, Sides
 from cvo_export.bundles.candidates import selected
+from cvo_export.bundles.crossed import Fold, calibrated_crossed
 from cvo_export.bundles.draft import (
     CAMERA_FRAME,
     WORLD_FRAME,
@@ -33,7 +35,8 @@ from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.datasets.sizes import one_size
 from cvo_export.graph.quantise import quantised
 from cvo_export.graph.to_onnx import OPSET, check_parity, export_onnx
-from cvo_export.training.run import Run
+from cvo_export.networks.heads import ExportedHead
+from cvo_export.training.run import PoseGraph, Run
 
 Array = NDArray[np.float64]
 
@@ -60,7 +63,8 @@ def publish(
 
     ``rule`` and ``cap`` None mean the default of the run's split (see ``chosen_rule``); ``score``
     None chooses the score on the val frames. ``int8`` quantises the backbone before calibration.
-    Scores and thresholds always come from the exported graph, run by ``provider``.
+    Scores and thresholds always come from the exported graph, run by ``provider``; in a crossed
+    run, from the graphs of its folds, which are exported in the same way.
 
     Raises
     ------
@@ -79,10 +83,35 @@ def publish(
     one_size(run.dataset)
     candidates = selected(run.graph.head.candidates(), score, sides)
     rule, cap = chosen_rule(rule, cap, run.split.kind)
-    model_bytes, parity = _export(run, precision)
+    model_bytes, parity = _export(run, run.graph.head, run.training_frames, precision)
     draft = _draft(run, model_bytes, name, (rule, cap), joint, parity, provider)
-    calibration = calibrated(draft, model_bytes, run.dataset, run.split.roles, candidates)
+    if run.folds:
+        folds = [
+            _fold(run, head, indices, draft, precision, score, sides)
+            for head, indices in zip(run.folds, run.fold_frames, strict=True)
+        ]
+        val = run.split.roles["val"]
+        calibration = calibrated_crossed(draft, model_bytes, run.dataset, val, candidates, folds)
+    else:
+        calibration = calibrated(draft, model_bytes, run.dataset, run.split.roles, candidates)
     return write_bundle(bundle_dir, calibration, model_bytes)
+
+
+def _fold(
+    run: Run,
+    head: ExportedHead,
+    indices: NDArray[np.int64],
+    draft: Draft,
+    precision: Precision,
+    score: str | None,
+    sides: Sides | None,
+) -> Fold:
+    """Export the network that was trained without these frames."""
+    others = run.training_frames[~np.isin(run.training_frames, indices)]
+    model_bytes, _ = _export(run, head, others, precision)
+    model = model_spec(model_bytes, OPSET, draft.model.provider)
+    candidates = selected(head.candidates(), score, sides)
+    return Fold(replace(draft, model=model), model_bytes, candidates, indices)
 
 
 class _Deployed(nn.Module):
@@ -95,22 +124,26 @@ class _Deployed(nn.Module):
         return outputs
 
 
-def _export(run: Run, precision: Precision) -> tuple[bytes, float]:
+def _export(
+    run: Run, head: ExportedHead, training: NDArray[np.int64], precision: Precision
+) -> tuple[bytes, float]:
     """Return the model bytes and the largest difference between torch and onnxruntime on val.
 
-    The difference is measured on the float32 graph, before any quantisation.
+    The difference is measured on the float32 graph, before any quantisation. ``training`` are the
+    frames that the head was trained on; some give the value ranges for 8 bits.
     """
-    config, head = run.config, run.graph.head
+    config = run.config
     image = torch.zeros((1, config.height, config.width, 3), dtype=torch.uint8)
     names = ["image", *head.extra_inputs]
     inputs = [image, *head.extra_inputs.values()]
-    graph = _Deployed(run.graph.backbone, head.deployed()).eval()
+    backbone = run.graph.backbone
+    graph = _Deployed(backbone, head.deployed()).eval()
     content = export_onnx(graph, inputs, names, head.output_names)
     feeds = _feeds(run, run.split.roles["val"][:_PARITY_FRAMES])
     session = Session(content)
-    parity = check_parity(run.graph, session, feeds, names, head.point_outputs)
+    trained = PoseGraph(backbone, head).eval()
+    parity = check_parity(trained, session, feeds, names, head.point_outputs)
     if precision == "int8":
-        training = np.concatenate([run.split.roles["train"], run.split.roles["fit"]])
         spread = np.linspace(0, training.size - 1, min(_RANGE_FRAMES, training.size)).astype(int)
         content = quantised(content, _feeds(run, training[spread]))
         session = Session(content)
@@ -161,13 +194,9 @@ def _draft(
 ) -> Draft:
     """Return the bundle's content except its score, thresholds and self-test."""
     config, target = run.config, run.target
-    roles = run.split.roles
     model = model_spec(model_bytes, OPSET, provider)
-    # The score's unit and the limits use all train and fit frames, even if the run used a share
-    # of them.
-    known = target.coordinates(
-        run.dataset.local_poses[np.concatenate([roles["train"], roles["fit"]])]
-    )
+    # The score's unit and the limits.
+    known = target.coordinates(run.dataset.local_poses[run.training_frames])
     return Draft(
         name=name,
         method=run.graph.head.runtime_method,
@@ -215,6 +244,7 @@ def _draft(
         joint=joint,
         split=run.split.spec(run.dataset),
         dataset=run.dataset.name,
+        crossed=run.config.crossed or None,
     )
 
 

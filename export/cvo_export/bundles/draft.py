@@ -90,6 +90,8 @@ class Draft:
         The camera of the calibration images, if it is not ``camera``.
     images
         Their size and colour; None before they have been read.
+    crossed
+        Number of folds of a crossed calibration, or None.
     """
 
     name: str
@@ -106,6 +108,7 @@ class Draft:
     running: Camera | None = None
     images: ImageSpec | None = None
     cap: float | None = None
+    crossed: int | None = None
 
     @classmethod
     def of(cls, calibration: Calibration) -> Draft:
@@ -175,6 +178,7 @@ class Draft:
                 n_effective=counts.effective,
                 split=self.split,
                 dataset=self.dataset,
+                crossed=self.crossed,
             ),
             selftest=SelfTest(
                 recipe="ripples-1",

@@ -185,12 +185,7 @@ def calibrated(
     UsageError
         Bonferroni's joint scope with a method that has one score for all six degrees of freedom.
     """
-    first = draft.head(candidates[0])
-    if draft.joint == "bonferroni" and first.one_joint_score:
-        raise UsageError(
-            f"joint: expected max for {draft.method}, which has one score for all six degrees of "
-            "freedom, found bonferroni"
-        )
+    first = first_head(draft, candidates)
     with draft.observer(model_bytes, first) as observer:
         val = observe(observer, dataset, roles["val"])
         cal = observe(observer, dataset, roles["cal"])
@@ -211,15 +206,32 @@ def calibrated(
         with draft.observer(model_bytes, head) as observer:
             val = observe(observer, dataset, roles["val"])
             cal = observe(observer, dataset, roles["cal"])
+    return completed(draft, model_bytes, head, cal.scored(head), val.scored(head))
+
+
+def first_head(draft: Draft, candidates: Sequence[Candidate]) -> Head:
+    """Return the head of the first candidate; raises as ``calibrated``."""
+    first = draft.head(candidates[0])
+    if draft.joint == "bonferroni" and first.one_joint_score:
+        raise UsageError(
+            f"joint: expected max for {draft.method}, which has one score for all six degrees of "
+            "freedom, found bonferroni"
+        )
+    return first
+
+
+def completed(
+    draft: Draft, model_bytes: bytes, head: Head, cal: Scored, val: Scored
+) -> Calibration:
+    """Return the calibration of a chosen head from scores of cal and val, with its self-test."""
     with draft.observer(model_bytes, head, stated=True) as observer:
         outputs = observe_selftest(observer, *SELFTEST_SIZE).outputs
     selftest = {
         spec.name: tuple(float(f"{value:.9g}") for value in outputs[spec.name].reshape(-1).tolist())
         for spec in draft.model.outputs
     }
-    scored = cal.scored(head)
-    found = thresholds(head, scored, val.scored(head), draft.rule, draft.joint, draft.cap)
-    return draft.calibrated(head, found, counts(scored), selftest)
+    found = thresholds(head, cal, val, draft.rule, draft.joint, draft.cap)
+    return draft.calibrated(head, found, counts(cal), selftest)
 
 
 def in_order(*observed: Observed) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:

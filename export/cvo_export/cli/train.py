@@ -84,6 +84,14 @@ def _train(
         Crop,
         typer.Option(help="Part of the image that the model sees.", rich_help_panel=NETWORK),
     ] = "none",
+    folds: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            help="Crossed calibration: every recording trains and calibrates, in this many folds.",
+            rich_help_panel=TRAINING,
+        ),
+    ] = None,
     seed: Annotated[
         int,
         typer.Option(min=0, help="Seed of split, training and noise.", rich_help_panel=TRAINING),
@@ -124,6 +132,7 @@ def _train(
         light=light,
         fine_tune=fine_tune,
         steps=steps,
+        folds=folds,
         head=options,
     )
     with show_progress() as progress:

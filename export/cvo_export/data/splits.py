@@ -3,7 +3,8 @@
 ``train`` fits the networks; ``fit`` is for models of residuals (CJP trains on train and fit
 together); ``val`` decides every choice (early stopping, score, scales); ``cal`` gives the
 thresholds and nothing else; ``test`` gives the final figures and nothing else. A split for
-calibrating an existing network on new data has no ``train`` and no ``fit``.
+calibrating an existing network on new data has no ``train`` and no ``fit``. In a crossed run, the
+recordings of ``train``, ``fit`` and ``cal`` all train and all give thresholds.
 """
 
 from __future__ import annotations
@@ -184,6 +185,38 @@ def training_frames(dataset: PoseDataset, split: Split, share: float) -> tuple[I
         order = np.random.default_rng((split.seed, number)).permutation(names)
         found.append(indices[np.isin(unit, order[: max(1, round(share * names.size))])])
     return found[0], found[1]
+
+
+def crossed_frames(dataset: PoseDataset, split: Split) -> Indices:
+    """Return the frame numbers of train, fit and cal, which all train in a crossed run.
+
+    Whole recordings one after the other, in an order that the split's seed draws.
+    """
+    indices = np.concatenate([split.roles[role] for role in ("train", "fit", "cal")])
+    recordings = np.unique(dataset.sequence[indices])
+    rank = np.random.default_rng((split.seed, len(indices))).permutation(recordings.size)
+    place = rank[np.searchsorted(recordings, dataset.sequence[indices])]
+    return indices[np.lexsort((indices, place))]
+
+
+def crossed_folds(dataset: PoseDataset, split: Split, count: int) -> list[Indices]:
+    """Divide the recordings of a crossed run into folds; returns their frame numbers."""
+    indices = crossed_frames(dataset, split)
+    return [indices[fold] for fold in deal_folds(dataset, split, indices, count)]
+
+
+def network_rows(dataset: PoseDataset, indices: Indices) -> int:
+    """Return how many of these frames train the network where models of residuals need others.
+
+    The rest, about a fifth, are the last recordings in the order of ``indices``, or the last frames
+    if there is a single recording.
+    """
+    shares = SHARES["training"]
+    kept = shares["train"] / (shares["train"] + shares["fit"])
+    starts = np.flatnonzero(np.diff(dataset.sequence[indices], prepend=-1))
+    if starts.size == 1:
+        return int(kept * indices.size)
+    return int(starts[min(starts.size - 1, max(1, round(kept * starts.size)))])
 
 
 def _counts(total: int, shares: Mapping[str, float]) -> dict[str, int]:

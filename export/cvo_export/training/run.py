@@ -7,15 +7,25 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
+import numpy as np
 import torch
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 from torch import Tensor, nn
 
 from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.files import whole_file, write_whole
 from cvo_edge.vocabulary import Crop, SplitKind
 from cvo_export.data.augment import AugmentConfig
-from cvo_export.data.splits import Split, make_split, read_split_spec, same_split
+from cvo_export.data.splits import (
+    Indices,
+    Split,
+    crossed_folds,
+    crossed_frames,
+    make_split,
+    read_split_spec,
+    same_split,
+    training_frames,
+)
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.datasets.sizes import one_size
 from cvo_export.networks.backbone import NO_WEIGHTS, Backbone, BackboneConfig, load_weights
@@ -56,6 +66,10 @@ class TrainConfig:
         features are recomputed and the head is trained again.
     share
         Fraction of the training frames used, to study how much data a method needs.
+    folds
+        Folds of a crossed run, where the recordings of train, fit and cal all train and calibrate.
+        Unset by default, which leaves ``config.json`` and the names of a study's cells as they
+        were.
     """
 
     dataset: str
@@ -78,6 +92,12 @@ class TrainConfig:
     fine_tune: int = 0
     backbone_learning_rate: float = 3e-4
     share: Annotated[float, Meta(gt=0, le=1)] = 1.0
+    folds: Annotated[int, Meta(ge=2)] | UnsetType = UNSET
+
+    @property
+    def crossed(self) -> int:
+        """Number of folds of a crossed run; 0 for others."""
+        return 0 if self.folds is UNSET else self.folds
 
     @property
     def method(self) -> str:
@@ -103,8 +123,8 @@ def decode_config(content: bytes) -> TrainConfig:
 class History(NamedTuple):
     """One evaluation on val.
 
-    ``candidate`` tells whether val may select the network; it is False for networks of other folds
-    and models of residuals.
+    ``candidate`` tells whether val may select the network; it is False for networks of folds and
+    models of residuals.
     """
 
     lesson: str
@@ -131,7 +151,11 @@ class PoseGraph(nn.Module):
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its configuration, its trained network and its history."""
+    """A finished run: its configuration, its trained network and its history.
+
+    ``folds`` are the heads of a crossed run that were trained without the recordings of each fold,
+    in the order of ``fold_frames``; empty for other runs.
+    """
 
     config: TrainConfig
     dataset: PoseDataset
@@ -140,6 +164,20 @@ class Run:
     graph: PoseGraph
     weights_sha256: str | None
     history: list[History]
+    folds: tuple[ExportedHead, ...] = ()
+
+    @property
+    def training_frames(self) -> Indices:
+        """Frame numbers that the run had for training, even if it used a share of them."""
+        if self.config.crossed:
+            return crossed_frames(self.dataset, self.split)
+        return np.concatenate(training_frames(self.dataset, self.split, 1.0))
+
+    @property
+    def fold_frames(self) -> list[Indices]:
+        """Frame numbers of each fold of a crossed run."""
+        count = self.config.crossed
+        return crossed_folds(self.dataset, self.split, count) if count else []
 
     def save(self, run_dir: Path) -> None:
         """Write the result of training atomically; raises SinkError."""
@@ -150,6 +188,7 @@ class Run:
             "target": [torch.from_numpy(values) for values in target],
             "weights_sha256": self.weights_sha256,
             "history": [tuple(entry) for entry in self.history],
+            "folds": [head.state_dict() for head in self.folds],
         }
         with whole_file(run_dir / NETWORK_FILE) as stream:
             torch.save(content, stream)
@@ -165,7 +204,11 @@ class Run:
 
     def lines(self) -> list[str]:
         """Return a summary of the run as lines of text."""
-        counts = ", ".join(f"{role} {indices.size}" for role, indices in self.split.roles.items())
+        sizes = {role: indices.size for role, indices in self.split.roles.items()}
+        if self.config.crossed:
+            together = sum(sizes.pop(role) for role in ("train", "fit", "cal"))
+            sizes = {f"train and cal in {self.config.crossed} folds": together, **sizes}
+        counts = ", ".join(f"{role} {size}" for role, size in sizes.items())
         best = self.best
         parameters = sum(parameter.numel() for parameter in self.graph.parameters())
         return [
@@ -248,9 +291,14 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
     target = Target(*(values.numpy() for values in stored["target"]))
     backbone, upper, _ = loaded_backbone(config, NO_WEIGHTS)
     setting = Setting(backbone.size, target, config.seed, upper)
+    restore = TRAINABLE[config.method].restore
     try:
         backbone.load_state_dict(stored["backbone"])
-        head = TRAINABLE[config.method].restore(setting, config.head, stored["head"])
+        head = restore(setting, config.head, stored["head"])
+        # A run of an earlier release has no key for folds.
+        folds = tuple(
+            restore(setting, config.head, state).eval() for state in stored.get("folds", ())
+        )
         history = [History(*entry) for entry in stored["history"]]
     except (RuntimeError, TypeError):
         raise UsageError(
@@ -258,4 +306,4 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
             f"{NETWORK_FILE}; train it again"
         ) from None
     graph = PoseGraph(backbone, head).eval()
-    return Run(config, opened, split, target, graph, stored["weights_sha256"], history)
+    return Run(config, opened, split, target, graph, stored["weights_sha256"], history, folds)

@@ -212,6 +212,9 @@ class Lessons(Protocol):
     # Number of training images: the first n_train have the role train, the rest the role fit.
     n_images: int
     n_train: int
+    # Training images of the run: more than n_images in a fold of a crossed run. What the amount of
+    # data decides follows this number, so that the heads of all folds are of one kind.
+    n_run: int
     # Whether the backbone is trained as well; residuals on frames it has seen are then too small.
     fine_tuned: bool
 

@@ -157,7 +157,7 @@ def learn_held_out(
     everything = np.arange(lessons.n_images)
     cross_fitted = residuals == "cross_fitted"
     if residuals == "auto":
-        cross_fitted = not lessons.fine_tuned and everything.size < _MANY_FRAMES
+        cross_fitted = not lessons.fine_tuned and lessons.n_run < _MANY_FRAMES
     if cross_fitted and lessons.fine_tuned:
         raise UsageError(
             "residuals: cross_fitted needs a frozen backbone; use held_out with --fine-tune"
