@@ -4,6 +4,7 @@
 """
 
 import json
+from functools import partial
 
 import pytest
 from typer.testing import CliRunner
@@ -13,6 +14,7 @@ from cvo_edge.output.records import read_records
 from cvo_edge.programs import cli as runtime
 from cvo_export import cli as training
 from cvo_export.networks.methods import TRAINABLE
+from cvo_export.study import grid
 
 from . import toy_network
 from .conftest import DATASET
@@ -93,13 +95,16 @@ def test_run_writes_its_intervals(bundle, tmp_path):
     assert any(record.interval is not None and record.interval.bounded for record in records)
 
 
-def test_compare_and_the_report_of_a_study_hold_it(bundle, tmp_path):
-    table = call(
-        training.app,
-        *("compare", DATASET, tmp_path / "compare", "--methods", "toy,split", "--seeds", "1"),
-        *("--backbone", "test_efficientnet", "--split", "random", "--jobs", "1"),
-        *("--weights", "none", "--copies", "1", "--steps", "100"),
-    )
+def test_compare_and_the_report_of_a_study_hold_it(bundle, tmp_path, monkeypatch):
+    # The command has no option for it; drawing pictures of full size is most of its time.
+    with monkeypatch.context() as patch:
+        patch.setattr(grid, "Grid", partial(grid.Grid, size="64x48"))
+        table = call(
+            training.app,
+            *("compare", DATASET, tmp_path / "compare", "--methods", "toy,split", "--seeds", "1"),
+            *("--backbone", "test_efficientnet", "--split", "random", "--jobs", "1"),
+            *("--weights", "none", "--copies", "1", "--steps", "100"),
+        )
     assert any(line.startswith("toy") for line in table.splitlines())
     (tmp_path / "study.toml").write_text(
         'title = "Toys"\n[[grids]]\nname = "toys"\nmethods = ["toy"]\nseeds = 1\n'
