@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import product
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -50,6 +50,7 @@ class Reason(StrEnum):
     IMAGE_TOO_SMALL = "image_too_small"  # degraded: fewer pixels than calibration images and model
     IMAGE_GREY = "image_grey"  # degraded: no colour, unlike the calibration images
     IMAGE_UNFAMILIAR = "image_unfamiliar"  # degraded: does not show the place the network knows
+    IMAGE_DEGRADED = "image_degraded"  # degraded: noisier or poorer than any calibrated image
     FRAME_REPEATED = "frame_repeated"  # degraded: the same image came before; it may be frozen
     PICTURE_STILL = "picture_still"  # degraded: the camera moves, as stated, but not its picture
     FRAME_STALE = "frame_stale"  # degraded: the frame waited for more than a second
@@ -59,6 +60,23 @@ class Reason(StrEnum):
     )
     PITCH_NEAR_90 = "pitch_near_90"  # ok: |pitch| > 80 deg, roll and yaw are ill-defined
     IMAGE_RESIZED = "image_resized"  # ok: another size than the calibration images; told once
+
+
+class Drift(NamedTuple):
+    """Whether the images of a stream are still like those of the calibration.
+
+    ``state``: ``unknown`` if the bundle cannot tell. ``reason`` and ``since``: why, and the number
+    of the first frame, during an alarm. ``false_alarms``: bound of the probability of a false
+    alarm, of a frame or a recording as the bundle states it; None if unknown.
+    """
+
+    state: Literal["clear", "alarm", "unknown"]
+    reason: Reason | None = None
+    since: int | None = None
+    false_alarms: float | None = None
+
+
+_UNKNOWN = Drift("unknown")
 
 
 class _Strict(Struct, frozen=True, forbid_unknown_fields=True):
@@ -100,7 +118,8 @@ class RecordedInterval(_Strict, frozen=True):
 class Record(_Strict, frozen=True):
     """The output for one frame: one JSON line, one CSV row or one line of the table.
 
-    ``factor`` is UNSET (no key) unless the thresholds adapt to labels.
+    ``factor`` is UNSET (no key) unless the thresholds adapt to labels; ``novelty`` and ``drift``
+    are UNSET if the bundle has no alarm.
     """
 
     seq: int
@@ -112,6 +131,8 @@ class Record(_Strict, frozen=True):
     interval: RecordedInterval | None
     latency_ms: dict[str, float]
     factor: tuple[float, ...] | UnsetType = UNSET
+    novelty: float | UnsetType | None = UNSET
+    drift: Literal["clear", "alarm"] | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +162,9 @@ class PoseInterval:
         What labels have made of the thresholds: 1 as calibrated, more is wider. One number in the
         joint scope, six in the marginal one (twelve for methods with two thresholds per DoF: lower,
         then upper); None if the odometer does not adapt.
+    drift, novelty
+        State of the stream, and how much this frame differs from calibrated ones, as a share of
+        what is still taken for one of them; None for a frame without outputs or without an alarm.
     """
 
     seq: int
@@ -155,6 +179,8 @@ class PoseInterval:
     chart: Chart
     latency_ms: Mapping[str, float] = field(default_factory=dict)
     factor: tuple[float, ...] | None = None
+    drift: Drift = _UNKNOWN
+    novelty: float | None = None
 
     @property
     def lower(self) -> Array:
@@ -248,6 +274,7 @@ class PoseInterval:
             interval,
             dict(self.latency_ms),
             UNSET if self.factor is None else self.factor,
+            *_recorded_drift(self.drift, self.novelty),
         )
 
     def to_dict(self, *, region: bool = False) -> dict[str, Any]:
@@ -302,6 +329,16 @@ class PoseInterval:
             f"<table><caption>{escape(caption)}</caption>"
             f"<tr><th>DoF</th><th>lower</th><th>upper</th></tr>{rows}</table>"
         )
+
+
+def _recorded_drift(
+    drift: Drift, novelty: float | None
+) -> tuple[float | UnsetType | None, Literal["clear", "alarm"] | UnsetType]:
+    if drift.state == "unknown":
+        return UNSET, UNSET
+    if novelty is None or not math.isfinite(novelty):
+        return None, drift.state
+    return round(novelty, 4), drift.state
 
 
 def _null_infinite(values: Iterable[float]) -> tuple[Any, ...]:

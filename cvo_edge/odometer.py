@@ -23,12 +23,12 @@ from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import ModelError, UsageError
-from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.estimate import Drift, PoseInterval, Reason, Status
 from cvo_edge.input.clock import SYSTEM_CLOCK
 from cvo_edge.input.frame import Frame
-from cvo_edge.input.frame_checks import StreamChecks
 from cvo_edge.monitor.adaptation import Adaptation
 from cvo_edge.monitor.labelled import Labelled
+from cvo_edge.monitor.watch import StreamWatch
 from cvo_edge.pose import Pose
 from cvo_edge.processed import Processed
 from cvo_edge.scheduling import checked_mode, plan, run_stream
@@ -114,9 +114,7 @@ class Odometer(Labelled):
         )
         self.chart = self._observer.chart
         self.origin_m = self._observer.origin_m
-        self._stream_checks = StreamChecks()
-        self._sizes = self._observer.stream_sizes()
-        self._camera_check = self._observer.camera_check()
+        self._watch = StreamWatch(self._observer, calibration.alarm)
         if adapt or state is not None:
             self._adaptation = Adaptation(self.head, self.chart, calibration, self.threshold, state)
         self._clock = SYSTEM_CLOCK
@@ -275,9 +273,7 @@ class Odometer(Labelled):
                 f"stream: expected frames or a source, found the path {os.fsdecode(frames)}; use "
                 "odometer.stream(open_source(path))"
             )
-        self._stream_checks = StreamChecks()
-        self._sizes = self._observer.stream_sizes()
-        self._camera_check = self._observer.camera_check()
+        self._watch = StreamWatch(self._observer, self.calibration.alarm)
         with closing(
             run_stream(
                 frames, self.mode, self._workers, self._process, lambda: self._seq, self._clock
@@ -308,15 +304,10 @@ class Odometer(Labelled):
         frame, observation = processed.frame, processed.observation
         self._seq = processed.seq + 1
         fault, found = observation.fault, processed.conformal_set
-        doubts = tuple(reason for reason in (observation.doubt, fault) if reason is not None)
         # The age counts until the estimate is given: a process may be stopped at any point.
         age_ms = frame.age_ms(self._clock.now_s())
-        doubts += self._sizes.doubts(observation.look)
-        doubts += self._stream_checks.doubts(
-            observation.look, frame.stamp_ns, age_ms, frame.fresh_noise, frame.moving
-        )
-        if self._camera_differs(observation, doubts):
-            doubts += (Reason.CAMERA_DIFFERS,)
+        verdict = self._watch.judge(observation, processed.seq, frame, age_ms)
+        doubts = verdict.doubts
         if doubts:
             found = unbounded_set()
         position_m = observation.pose[:3]
@@ -339,13 +330,14 @@ class Odometer(Labelled):
             chart=self.chart,
             latency_ms=processed.latency_ms(),
             factor=None if level is None else level.factor,
+            drift=verdict.drift,
+            novelty=verdict.novelty,
         )
 
-    def _camera_differs(self, observation: Observation, doubts: tuple[Reason, ...]) -> bool:
-        """Pass a frame to the camera check, unless something else is wrong with it."""
-        if self._camera_check is None or doubts not in ((), (Reason.IMAGE_UNFAMILIAR,)):
-            return False
-        return self._camera_check.differs(observation.outputs, familiar=not doubts)
+    @property
+    def drift(self) -> Drift:
+        """Whether the stream's images are still like those of the calibration."""
+        return self._watch.drift
 
     @property
     def seen_camera(self) -> LensEstimate | None:
@@ -353,12 +345,12 @@ class Odometer(Labelled):
 
         None if the method cannot tell, for fewer than 20 frames, or if no camera explains them.
         """
-        return None if self._camera_check is None else self._camera_check.estimate()
+        return self._watch.seen_camera
 
     @property
     def unproven_frames(self) -> int:
         """Frames of the stream without fresh noise, whose equal parts prove no repetition."""
-        return self._stream_checks.unproven
+        return self._watch.unproven
 
     def _remarks(self, observation: Observation, found: ConformalSet) -> tuple[Reason, ...]:
         remarks: tuple[Reason, ...] = ()
@@ -366,7 +358,7 @@ class Odometer(Labelled):
             remarks += (Reason.BOUNDS_CROSSED,)
         if self.chart.rotation == "euler_zyx" and abs(observation.point[4]) > _STEEP_PITCH:
             remarks += (Reason.PITCH_NEAR_90,)
-        return remarks + self._sizes.remarks(observation.look)
+        return remarks + self._watch.remarks(observation)
 
     def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
         """Run the network on one image without applying a threshold; see ``Observer.observe``.

@@ -20,6 +20,13 @@ _SAME_CONFIDENCE = 1e-7
 # Every bundle stores at least these confidences, for both scopes.
 CONFIDENCES = (0.5, 0.8, 0.9, 0.95, 0.99)
 
+# What a graph may tell of a frame besides its pose: the four numbers of the output ``novelty`` and
+# the one of ``degradation``.
+STATISTICS = ("nearest", "cell", "mean", "colour", "degradation")
+NOVELTY_OUTPUT, DEGRADATION_OUTPUT = "novelty", "degradation"
+# The outputs that a graph of any method may have for that, with their shapes.
+FAMILIARITY = {NOVELTY_OUTPUT: (1, len(STATISTICS) - 1), DEGRADATION_OUTPUT: (1, 1)}
+
 # No control characters and no lone surrogates: texts are printed on terminals.
 Text = Annotated[
     str, Meta(min_length=1, max_length=200, pattern="^[^\x00-\x1f\x7f-\x9f\ud800-\udfff]+$(?!\n)")
@@ -35,6 +42,8 @@ Number = Annotated[float, Meta(gt=-MAX_NUMBER, lt=MAX_NUMBER)]
 Positive = Annotated[float, Meta(gt=0, lt=MAX_NUMBER)]
 Six = tuple[Number, Number, Number, Number, Number, Number]
 SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
+Five = tuple[Number, Number, Number, Number, Number]
+FivePositive = tuple[Positive, Positive, Positive, Positive, Positive]
 NumberOrNone = Number | None
 SixOrUnbounded = tuple[
     NumberOrNone, NumberOrNone, NumberOrNone, NumberOrNone, NumberOrNone, NumberOrNone
@@ -185,6 +194,20 @@ class CalibrationSpec(_Strict, frozen=True, omit_defaults=True):
     crossed: Annotated[int, Meta(ge=2, le=10**9)] | None = None
 
 
+class AlarmSpec(_Strict, frozen=True):
+    """Usual values, scales and limits of the five statistics of a frame, see ``STATISTICS``.
+
+    ``kind``: whether single frames or running statistics of recordings are limited; ``n``: how many
+    frames or recordings the limits come from. ``limits`` are in units of ``scales``.
+    """
+
+    kind: Literal["frames", "recordings"]
+    usual: Five
+    scales: FivePositive
+    limits: FivePositive
+    n: Annotated[int, Meta(ge=1, le=10**9)]
+
+
 class SelfTest(_Strict, frozen=True):
     """A synthetic image from an integer recipe, and the outputs expected for it."""
 
@@ -227,7 +250,8 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
     """The contents of ``calibration.json``, version 1.
 
     ``camera``: intrinsics of the calibration images' camera; null if the data set does not state
-    them. ``images``: their size and colour; null in bundles of earlier releases.
+    them. ``images``: their size and colour; null in bundles of earlier releases. ``alarm``: when a
+    stream's images are no longer like those of the calibration; null if the graph does not tell.
     """
 
     schema_version: Literal[1]
@@ -244,6 +268,7 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
     digest: Sha256
     camera: Camera | None = None
     images: ImageSpec | None = None
+    alarm: AlarmSpec | None = None
 
     def threshold(self, confidence: float, scope: Scope) -> Threshold | None:
         """Return the stored threshold for this confidence and scope, or None.

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from cvo_edge.bundle.format import (
     CONFIDENCES,
+    FAMILIARITY,
     Calibration,
     SixOrUnbounded,
     TensorSpec,
@@ -137,6 +138,11 @@ def _check_model(calibration: Calibration) -> None:
         names = [spec.name for spec in tensors]
         if len(set(names)) != len(names):
             raise CalibrationFileError(f"model: expected unique tensor names, found {shown(names)}")
+    outputs = {spec.name for spec in model.outputs}
+    if calibration.alarm is not None and not outputs >= FAMILIARITY.keys():
+        raise CalibrationFileError(
+            "alarm: expected null for a model without outputs novelty and degradation, found limits"
+        )
     sizes = {spec.name: math.prod(spec.shape) for spec in model.outputs}
     given = {name: len(values) for name, values in calibration.selftest.outputs.items()}
     if sizes != given:

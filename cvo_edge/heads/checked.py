@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cvo_edge.bundle.format import Calibration, ModelSpec, Threshold
+from cvo_edge.bundle.format import FAMILIARITY, Calibration, ModelSpec, Threshold
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError
 from cvo_edge.heads import HEADS, Head
 
@@ -57,6 +57,9 @@ def check_tensors(model: ModelSpec, head: Head) -> None:
         ("outputs", outputs, model.outputs),
     ):
         found = {spec.name: (spec.dtype, spec.shape) for spec in specs}
+        if kind == "outputs" and found.keys() >= FAMILIARITY.keys():
+            # Any graph may have these.
+            needed = needed | {name: ("float32", shape) for name, shape in FAMILIARITY.items()}
         if found != needed:
             raise BundleMismatchError(
                 f"model.{kind}: expected {needed} for method {head.method}, found {found}"

@@ -18,7 +18,7 @@ from cvo_edge.input.repetition import Repetition
 Image8 = NDArray[np.uint8]
 
 # Every eighth pixel of every eighth row: 768 pixels at 256x192.
-_STEP = 8
+SAMPLE_STEP = 8
 # Grey levels out of 255. Noise behind a lens cap rarely exceeds the first. In an overexposed image
 # more than half of all values reach the second. An image without contrast has a standard deviation
 # below the third; that of a normal image is ten times as large.
@@ -38,8 +38,8 @@ class Look:
 
     def __init__(self, tensor: Image8, size: tuple[int, int]) -> None:
         self.tensor, self.size = tensor, size
-        half = _STEP // 2
-        self.sample: Image8 = tensor[0, half::_STEP, half::_STEP].reshape(-1, 3)
+        half = SAMPLE_STEP // 2
+        self.sample: Image8 = tensor[0, half::SAMPLE_STEP, half::SAMPLE_STEP].reshape(-1, 3)
 
 
 def image_doubt(look: Look) -> Reason | None:

@@ -1,1 +1,1 @@
-"""What watches an odometer at work, and corrects it: adaptation to labels."""
+"""What watches an odometer at work: the alarm without labels, and the adaptation to labels."""

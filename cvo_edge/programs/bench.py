@@ -52,6 +52,7 @@ class _Found:
     ratios: list[float] = field(default_factory=list)
     latency: LatencyProfile = field(default_factory=LatencyProfile)
     valid: int = 0
+    in_alarm: int = 0
     skipped: int = 0
     wall_s: float = 0.0
     cpu_s: float = 0.0
@@ -81,7 +82,8 @@ def benchmark(
     frame at its interval in ``live``. Files are read repeatedly, in ``live`` at 30 frames per
     second. Without a source, the benchmark uses a synthetic still image; if its pose is
     implausible, the conformal step is not run. ``frames_valid`` counts frames with a plausible
-    pose. Invalid frames of a source are not timed. Returns the report of ``cvo-edge bench --json``.
+    pose, ``frames_in_alarm`` those during an alarm. Invalid frames of a source are not timed.
+    Returns the report of ``cvo-edge bench --json``.
 
     Raises UsageError for invalid counts, SourceError if the source gives no valid frame, and the
     errors of ``Odometer.load``.
@@ -115,6 +117,7 @@ def benchmark(
         "mode": odometer.mode,
         "frames": frames,
         "frames_valid": found.valid,
+        "frames_in_alarm": found.in_alarm,
         "frames_skipped": found.skipped,
         "warmup": warmup,
         "latency_ms": found.latency.summary(),
@@ -150,6 +153,7 @@ def _steps(
             raw_ms = _raw_ms(session, feeds)
         if count >= warmup and _counts(estimate, stream):
             found.valid += estimate.pose is not None
+            found.in_alarm += estimate.drift.state == "alarm"
             found.latency.add(estimate.latency_ms)
             found.raw_ms.append(raw_ms)
             found.ratios.append(1e3 * spent_s / raw_ms)
@@ -182,6 +186,7 @@ def _streams(
                 before = estimate.seq
                 if _counts(estimate, stream):
                     found.valid += estimate.pose is not None
+                    found.in_alarm += estimate.drift.state == "alarm"
                     found.latency.add(estimate.latency_ms)
                     ages_ms.append(estimate.latency_ms["total"])
             spent_s, cpu_s = perf_counter() - begin, process_time() - cpu_begin
@@ -252,6 +257,8 @@ def _remarks(report: dict[str, Any]) -> list[str]:
             f"{report['frames_valid']} of {report['frames']} frames gave a plausible pose; "
             "give a SOURCE from the bundle's scene to time the conformal step on every frame"
         )
+    if report["frames_in_alarm"]:
+        remarks.append(f"{report['frames_in_alarm']} frames during an alarm: they have no interval")
     if report["waited_for_cores"] > _BUSY_SHARE:
         remarks.append(
             f"busy machine: {report['waited_for_cores']:.0%} of the time was spent waiting for a "

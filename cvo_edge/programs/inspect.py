@@ -16,6 +16,7 @@ from cvo_edge.guarantee import by_level, left_out_text, statement
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.heads.checked import checked_head
 from cvo_edge.heads.plausible import check_plausible, selftest_sets
+from cvo_edge.monitor.alarm import alarm_statement
 from cvo_edge.pose import Chart
 
 # The confidence of the measured coverage that is shown.
@@ -50,6 +51,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         *_crossed(source),
         *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
         *([] if calibration.images is None else _entry("images", _images(calibration.images))),
+        *_entry("alarm", alarm_statement(calibration.alarm)),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
         *_entry("self-test", _selftest(calibration.selftest)),
         *_entry("backbone", calibration.provenance.backbone or "a network supplied as ONNX"),

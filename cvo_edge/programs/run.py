@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.camera_check import LensEstimate
-from cvo_edge.estimate import PoseInterval, Status
+from cvo_edge.estimate import Drift, PoseInterval, Status
 from cvo_edge.ground_truth import GroundTruth
 from cvo_edge.input.frame import Source
 from cvo_edge.input.image_files import ImageFiles, left_out_text
@@ -37,7 +37,8 @@ class RunSummary:
     those whose set holds the true value, per degree of freedom; ``camera`` is what the frames show
     of the camera, if they do; ``left_out`` counts the images of a folder that are no frames,
     ``unproven`` the frames whose equal parts prove no repetition; ``labels`` are those that the
-    thresholds have adapted to.
+    thresholds have adapted to; ``in_alarm`` counts frames during an alarm, and ``drift`` is the
+    last frame's.
     """
 
     dof: tuple[str, ...]
@@ -56,6 +57,8 @@ class RunSummary:
     covered: Array = field(default_factory=lambda: np.zeros(6))
     covered_jointly: int = 0
     camera: LensEstimate | None = None
+    in_alarm: int = 0
+    drift: Drift | None = None
     left_out: Mapping[str, int] = field(default_factory=dict)
     labels: Labels | None = None
     unproven: int = 0
@@ -69,6 +72,8 @@ class RunSummary:
         self.statuses[estimate.status] += 1
         self.reasons.update(estimate.reasons)
         self.latency.add(estimate.latency_ms)
+        self.drift = estimate.drift
+        self.in_alarm += estimate.drift.state == "alarm"
         if estimate.bounded:
             self.bounded += 1
             self.width_sum += estimate.conformal_set.width()
@@ -79,6 +84,16 @@ class RunSummary:
             self.compared += 1
             self.covered += estimate.covers(truth)
             self.covered_jointly += estimate.contains(truth)
+
+    def _drift_text(self, drift: Drift) -> str:
+        if drift.state == "unknown":
+            return "unknown: this bundle has no alarm"
+        if not self.in_alarm:
+            return "clear: no alarm"
+        now = "clear at the end"
+        if drift.state == "alarm":
+            now = f"{drift.reason} since frame {drift.since}"
+        return f"alarm during {self.in_alarm} frames, {now}"
 
     @property
     def frames(self) -> int:
@@ -103,6 +118,8 @@ class RunSummary:
                 f"not checked {self.unproven} frames, for parts equal to earlier ones: their codec "
                 "repeats what stands still"
             )
+        if self.drift is not None:
+            lines.append(f"drift       {self._drift_text(self.drift)}")
         if self.camera is not None:
             fx, fy, k1, frames = self.camera
             wrong = max(abs(math.log(fx)), abs(math.log(fy))) > _WORTH_A_LOOK

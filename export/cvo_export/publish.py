@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -16,6 +17,7 @@ from cvo_edge.bundle.format import Calibration, PoseSpec, PreprocessSpec, Proven
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
 from cvo_edge.input import preprocess
+from cvo_edge.input.frame_checks import SAMPLE_STEP
 from cvo_edge.vocabulary import Joint, Precision, Provider, Rule, Sides
 from cvo_export.bundles.candidates import selected
 from cvo_export.bundles.crossed import Fold, calibrated_crossed
@@ -33,9 +35,13 @@ from cvo_export.bundles.rule import chosen_rule
 from cvo_export.bundles.thresholds import calibrated
 from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.datasets.sizes import one_size
+from cvo_export.graph.familiarise import familiarised
+from cvo_export.graph.familiarity_nodes import CELLS, PIXELS
 from cvo_export.graph.quantise import quantised
 from cvo_export.graph.to_onnx import OPSET, check_parity, export_onnx
+from cvo_export.networks.backbone import Backbone, Pooled
 from cvo_export.networks.heads import ExportedHead
+from cvo_export.networks.stem import Stem
 from cvo_export.training.run import PoseGraph, Run
 
 Array = NDArray[np.float64]
@@ -115,13 +121,33 @@ def _fold(
 
 
 class _Deployed(nn.Module):
-    def __init__(self, backbone: nn.Module, head: nn.Module) -> None:
+    """The method's outputs, then the features by cell and some pixels, for familiarity.
+
+    The features are those of the last stage, (1, cells, channels), the pixels those of the frame
+    checks.
+    """
+
+    backbone: Backbone | Stem
+
+    def __init__(self, graph: PoseGraph, image: torch.Tensor) -> None:
         super().__init__()
-        self.backbone, self.head = backbone, head
+        self.backbone, self.head = graph.backbone, graph.head.deployed()
+        self.pooled = None
+        if isinstance(self.backbone, Stem):
+            with torch.no_grad():
+                _, channels, rows, columns = self.head(self.backbone(image))[-1].shape
+            self.pooled = Pooled((channels, rows, columns))
 
     def forward(self, image: torch.Tensor, *extra: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        outputs: tuple[torch.Tensor, ...] = self.head(self.backbone(image), *extra)
-        return outputs
+        features = self.backbone(image)
+        outputs = self.head(features, *extra)
+        if isinstance(self.backbone, Backbone):
+            cells = self.backbone.cells(features)
+        elif self.pooled is not None:
+            *outputs, deep = outputs
+            cells = self.pooled.cells(deep)
+        some = slice(SAMPLE_STEP // 2, None, SAMPLE_STEP)
+        return *outputs, cells, image[:, some, some]
 
 
 def _export(
@@ -130,19 +156,19 @@ def _export(
     """Return the model bytes and the largest difference between torch and onnxruntime on val.
 
     The difference is measured on the float32 graph, before any quantisation. ``training`` are the
-    frames that the head was trained on; some give the value ranges for 8 bits.
+    frames that the head was trained on; some give the value ranges for 8 bits and the statistics of
+    familiarity.
     """
     config = run.config
     image = torch.zeros((1, config.height, config.width, 3), dtype=torch.uint8)
     names = ["image", *head.extra_inputs]
     inputs = [image, *head.extra_inputs.values()]
-    backbone = run.graph.backbone
-    graph = _Deployed(backbone, head.deployed()).eval()
-    content = export_onnx(graph, inputs, names, head.output_names)
+    trained = PoseGraph(run.graph.backbone, head).eval()
+    graph = _Deployed(trained, image).eval()
+    content = export_onnx(graph, inputs, names, (*head.output_names, CELLS, PIXELS))
     feeds = _feeds(run, run.split.roles["val"][:_PARITY_FRAMES])
     session = Session(content)
-    trained = PoseGraph(backbone, head).eval()
-    parity = check_parity(trained, session, feeds, names, head.point_outputs)
+    parity = check_parity(trained, session, feeds, names, head.output_names, head.point_outputs)
     if precision == "int8":
         spread = np.linspace(0, training.size - 1, min(_RANGE_FRAMES, training.size)).astype(int)
         content = quantised(content, _feeds(run, training[spread]))
@@ -152,22 +178,28 @@ def _export(
         after = Session(completed)
         for feed in feeds:
             _compare(head.completed_outputs(session.run(feed)), after.run(feed))
-    return completed, parity
+    return familiarised(completed, run.dataset, training, _feed_of(run), config.seed), parity
 
 
-def _feeds(run: Run, indices: NDArray[np.int64]) -> list[dict[str, NDArray[np.generic]]]:
-    """Return the model inputs for these frames; extra inputs are standard normal noise."""
+def _feeds(run: Run, indices: NDArray[np.int64]) -> list[dict[str, NDArray[Any]]]:
+    """Return the model inputs for these frames."""
+    feed = _feed_of(run)
+    return [feed(run.dataset.read_image(index)) for index in indices.tolist()]
+
+
+def _feed_of(run: Run) -> Callable[[NDArray[np.uint8]], dict[str, NDArray[Any]]]:
+    """Return the function image -> model inputs; extra inputs are standard normal noise."""
     config, generator = run.config, np.random.default_rng(0)
-    feeds = []
-    for index in indices.tolist():
-        bgr = run.dataset.read_image(index)
-        feed: dict[str, NDArray[np.generic]] = {
-            "image": preprocess.model_input(bgr, config.height, config.width, config.crop)
+
+    def feed(bgr: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+        image = preprocess.model_input(bgr, config.height, config.width, config.crop)
+        extras = {
+            name: generator.standard_normal(example.shape).astype(np.float32)
+            for name, example in run.graph.head.extra_inputs.items()
         }
-        for extra, example in run.graph.head.extra_inputs.items():
-            feed[extra] = generator.standard_normal(example.shape).astype(np.float32)
-        feeds.append(feed)
-    return feeds
+        return {"image": image, **extras}
+
+    return feed
 
 
 def _compare(

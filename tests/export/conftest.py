@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from cvo_export import publish as publishing
+from cvo_export.bundles import alarm
 from cvo_export.data.augment import AugmentConfig
 from cvo_export.datasets import synthetic
-from cvo_export.graph import to_onnx
+from cvo_export.graph import familiarise, to_onnx
 from cvo_export.networks.backbone import BackboneConfig
 from cvo_export.networks.heads.cjp import CjpConfig
 from cvo_export.publish import publish
@@ -76,6 +77,16 @@ def _exported_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(features, "export_onnx", export_once)
         patch.setattr(publishing, "export_onnx", export_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _few_copies() -> Iterator[None]:
+    """Fit the alarm to a tenth of the frames: its laws do not depend on how many there are."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, count in (("_FRAMES", 120), ("_HARMLESS", 15), ("_NOISY", 36), ("_CHECKED", 4)):
+            patch.setattr(familiarise, name, count)
+        patch.setattr(alarm, "_CHANGED_FRAMES", 25)
         yield
 
 

@@ -71,13 +71,16 @@ def test_nothing_but_two_files_and_no_path_in_them(tiny_bundle, tiny_run):
 
 
 def test_torch_and_the_graph_agree_and_another_graph_does_not(tiny_bundle, tiny_run):
-    session = Session(read_bundle(tiny_bundle).model_bytes)
+    session, outputs = (
+        Session(read_bundle(tiny_bundle).model_bytes),
+        tiny_run.graph.head.output_names,
+    )
     image = np.random.default_rng(0).integers(0, 255, (1, 48, 64, 3)).astype(np.uint8)
-    assert check_parity(tiny_run.graph, session, [{"image": image}], ["image"]) < 1e-4
+    assert check_parity(tiny_run.graph, session, [{"image": image}], ["image"], outputs) < 1e-4
     other = copy.deepcopy(tiny_run.graph)
     other.head.decoder.mean += 1.0
     with pytest.raises(GateError, match="agree"):
-        check_parity(other, session, [{"image": image}], ["image"])
+        check_parity(other, session, [{"image": image}], ["image"], outputs)
 
 
 class _Scaled(nn.Module):
@@ -97,7 +100,7 @@ def test_parity_is_relative_to_numbers_above_one(size):
     feed = {"x": np.ones((1, 1), np.float32)}
 
     def difference(part: float) -> float:
-        return check_parity(_Scaled(size * (1.0 + part)), session, [feed], ["x"])
+        return check_parity(_Scaled(size * (1.0 + part)), session, [feed], ["x"], ["y"])
 
     assert difference(5e-5) == pytest.approx(5e-5, rel=0.01)
     for wrong in (2e-4, np.nan, np.inf):
@@ -109,9 +112,9 @@ def test_a_large_number_excuses_no_error_of_a_small_one_beside_it():
     """A pose holds metres and a quaternion: 500 m away, the rotation must still agree."""
     feed = {"x": np.array([[500.0, 1.0]], np.float32)}
     session = Session(export_onnx(_Scaled([1.0, 1.0]), [torch.ones((1, 2))], ["x"], ["y"]))
-    assert check_parity(_Scaled([1.0 + 5e-5, 1.0]), session, [feed], ["x"]) < 1e-4
+    assert check_parity(_Scaled([1.0 + 5e-5, 1.0]), session, [feed], ["x"], ["y"]) < 1e-4
     with pytest.raises(GateError, match="agree"):
-        check_parity(_Scaled([1.0, 1.0 + 2e-4]), session, [feed], ["x"])
+        check_parity(_Scaled([1.0, 1.0 + 2e-4]), session, [feed], ["x"], ["y"])
 
 
 def test_a_number_of_a_far_point_is_compared_with_the_distance_of_the_point():
@@ -119,7 +122,7 @@ def test_a_number_of_a_far_point_is_compared_with_the_distance_of_the_point():
     session = Session(export_onnx(_Scaled([1.0] * 3), [torch.ones((1, 3))], ["x"], ["y"]))
 
     def difference(part: float) -> float:
-        return check_parity(_Scaled([1.0, 1.0 + part, 1.0]), session, [feed], ["x"], ["y"])
+        return check_parity(_Scaled([1.0, 1.0 + part, 1.0]), session, [feed], ["x"], ["y"], ["y"])
 
     assert difference(2e-3) == pytest.approx(2e-3 / np.sqrt(1610.0), rel=0.01)
     for wrong in (5e-3, np.nan, np.inf):

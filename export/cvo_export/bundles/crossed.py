@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Calibration
 from cvo_edge.heads import Candidate
+from cvo_export.bundles.alarm import Pair, fitted_alarm, tells, together, with_copies
 from cvo_export.bundles.draft import Draft, images_of
 from cvo_export.bundles.thresholds import (
     Observed,
@@ -45,6 +47,13 @@ class Fold(NamedTuple):
         first = self.draft.head(self.candidates[0])
         with self.draft.observer(self.model_bytes, first) as observer:
             return observe(observer, dataset, self.indices)
+
+    def copied(self, dataset: PoseDataset, seen: Observed, number: int) -> Pair:
+        """Return the statistics of observed frames and of their copies, for the alarm."""
+        head = self.draft.head(self.candidates[number])
+        with self.draft.observer(self.model_bytes, head) as observer:
+            see = partial(observe, observer)
+            return with_copies(see, dataset, self.draft.split, seen, whole=True)
 
     def scored(self, seen: Observed, number: int) -> Scored:
         """Return the scores of observed frames by the candidate of this number."""
@@ -76,4 +85,12 @@ def calibrated_crossed(
     scores = [fold.scored(each, number) for fold, each in zip(folds, seen, strict=True)]
     cal = Scored(*(np.concatenate(parts) for parts in zip(*scores, strict=True)))
     head = draft.head(best)
-    return completed(draft, model_bytes, head, cal, val.scored(head))
+    alarm = None
+    if tells(val):
+        with draft.observer(model_bytes, head) as observer:
+            known = with_copies(partial(observe, observer), dataset, draft.split, val)
+        left_out = [
+            fold.copied(dataset, each, number) for fold, each in zip(folds, seen, strict=True)
+        ]
+        alarm = fitted_alarm(draft.split.kind, known, together(left_out))
+    return completed(draft, model_bytes, head, cal, val.scored(head), alarm)

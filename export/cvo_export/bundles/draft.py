@@ -17,6 +17,7 @@ from cvo_edge import geometry
 from cvo_edge.bundle.format import (
     MODEL_FILE,
     SELFTEST_TOLERANCE,
+    AlarmSpec,
     Calibration,
     CalibrationSpec,
     ImageSpec,
@@ -153,6 +154,7 @@ class Draft:
         thresholds: tuple[Threshold, ...],
         counts: Counts,
         selftest: Mapping[str, tuple[float, ...]],
+        alarm: AlarmSpec | None,
     ) -> Calibration:
         """Return the content of ``calibration.json``; the digest is set when it is written.
 
@@ -190,6 +192,7 @@ class Draft:
             provenance=self.provenance,
             camera=self.camera,
             images=self.images,
+            alarm=alarm,
             digest=UNWRITTEN,
         )
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import (
     CONFIDENCES,
+    AlarmSpec,
     Calibration,
     LeftOut,
     PoseSpec,
@@ -42,6 +43,7 @@ from cvo_edge.pose import about
 from cvo_edge.programs.selftest import observe_selftest
 from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import SCOPES, Joint, Rule, Scope
+from cvo_export.bundles.alarm import fitted_alarm, tells, with_copies
 from cvo_export.bundles.draft import SELFTEST_SIZE, Counts, Draft, images_of
 from cvo_export.bundles.rule import left_out
 from cvo_export.datasets import PoseDataset
@@ -206,7 +208,13 @@ def calibrated(
         with draft.observer(model_bytes, head) as observer:
             val = observe(observer, dataset, roles["val"])
             cal = observe(observer, dataset, roles["cal"])
-    return completed(draft, model_bytes, head, cal.scored(head), val.scored(head))
+    alarm = None
+    if tells(val):
+        with draft.observer(model_bytes, head) as observer:
+            given = partial(observe, observer), dataset, draft.split
+            copies = with_copies(*given, val), with_copies(*given, cal, whole=True)
+        alarm = fitted_alarm(draft.split.kind, *copies)
+    return completed(draft, model_bytes, head, cal.scored(head), val.scored(head), alarm)
 
 
 def first_head(draft: Draft, candidates: Sequence[Candidate]) -> Head:
@@ -221,7 +229,12 @@ def first_head(draft: Draft, candidates: Sequence[Candidate]) -> Head:
 
 
 def completed(
-    draft: Draft, model_bytes: bytes, head: Head, cal: Scored, val: Scored
+    draft: Draft,
+    model_bytes: bytes,
+    head: Head,
+    cal: Scored,
+    val: Scored,
+    alarm: AlarmSpec | None,
 ) -> Calibration:
     """Return the calibration of a chosen head from scores of cal and val, with its self-test."""
     with draft.observer(model_bytes, head, stated=True) as observer:
@@ -231,7 +244,7 @@ def completed(
         for spec in draft.model.outputs
     }
     found = thresholds(head, cal, val, draft.rule, draft.joint, draft.cap)
-    return draft.calibrated(head, found, counts(cal), selftest)
+    return draft.calibrated(head, found, counts(cal), selftest, alarm)
 
 
 def in_order(*observed: Observed) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:

@@ -25,6 +25,7 @@ from cvo_export.vocabulary import Normalisation
 FINAL = "final"
 TIMM_WEIGHTS = "timm"
 NO_WEIGHTS = "none"
+_GRID = (3, 4)
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,8 @@ class Backbone(nn.Module):
                 )
             self.register_buffer(f"_rows{number}", averaging(map_height, rows))
             self.register_buffer(f"_columns{number}", averaging(map_width, columns).T)
-        self.size = sum(shape[0] for shape in self.map_shapes) * config.grid[0] * config.grid[1]
+        self.channels = sum(shape[0] for shape in self.map_shapes)
+        self.size = self.channels * config.grid[0] * config.grid[1]
 
     def _cut(self) -> list[int]:
         """Drop the layers after the last stage used; returns timm's indices of the stages."""
@@ -138,6 +140,34 @@ class Backbone(nn.Module):
             columns = getattr(self, f"_columns{number}")
             pooled.append((rows @ feature_map @ columns).flatten(1))
         return torch.cat(pooled, dim=1)
+
+    def cells(self, features: Tensor) -> Tensor:
+        """Features (n, size) -> the same numbers by cell of the grid, (n, cells, channels)."""
+        count = self.config.grid[0] * self.config.grid[1]
+        sizes = [shape[0] * count for shape in self.map_shapes]
+        parts = [part.reshape(len(part), -1, count) for part in torch.split(features, sizes, dim=1)]
+        return torch.cat(parts, dim=1).transpose(1, 2)
+
+
+class Pooled(nn.Module):
+    """A map (n, channels, rows, columns) -> its means over a 3x4 grid, (n, size)."""
+
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        super().__init__()
+        channels, rows, columns = shape
+        self.register_buffer("rows", averaging(rows, min(_GRID[0], rows)))
+        self.register_buffer("columns", averaging(columns, min(_GRID[1], columns)).T)
+        self.rows: Tensor
+        self.columns: Tensor
+        self.size = channels * self.rows.shape[0] * self.columns.shape[1]
+
+    def forward(self, deep: Tensor) -> Tensor:
+        """Shape (n, channels, rows, columns) -> (n, size)."""
+        return (self.rows @ deep @ self.columns).flatten(1)
+
+    def cells(self, deep: Tensor) -> Tensor:
+        """Shape (n, channels, rows, columns) -> (n, cells, channels)."""
+        return (self.rows @ deep @ self.columns).flatten(2).transpose(1, 2)
 
 
 def load_weights(backbone: Backbone, weights: str) -> str | None:

@@ -145,7 +145,10 @@ class ExportedHead(nn.Module):
         """Return the scores val chooses from; the first wins unless another is clearly better."""
 
     def deployed(self) -> nn.Module:
-        """Return the module to export, by default itself: the same outputs at a lower cost."""
+        """Return the module to export, by default itself: the same outputs at a lower cost.
+
+        For a method with cells, it also returns the map of the last stage, after the outputs.
+        """
         return self
 
     def choices(self) -> Mapping[str, float]:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from cvo_edge.heads import Candidate
 from cvo_edge.heads.fused import FusedParameters
-from cvo_export.networks.backbone import averaging
+from cvo_export.networks.backbone import Pooled
 from cvo_export.networks.heads.base import (
     Examples,
     ExportedHead,
@@ -39,30 +39,12 @@ from cvo_export.networks.stem import Upper
 
 Array = NDArray[np.float64]
 
-_GRID = (3, 4)
 _REGRESSION = CjpConfig()
 _REGRESSION_STEPS = 6000
 
 
 class FusedConfig(ScrConfig, frozen=True, tag="fused", tag_field="method"):
     """Options of the cells' network; the regression has CJP's defaults."""
-
-
-class Pooled(nn.Module):
-    """Last map (n, channels, rows, columns) -> its means over a 3x4 grid, (n, size)."""
-
-    def __init__(self, shape: tuple[int, int, int]) -> None:
-        super().__init__()
-        channels, rows, columns = shape
-        self.register_buffer("rows", averaging(rows, min(_GRID[0], rows)))
-        self.register_buffer("columns", averaging(columns, min(_GRID[1], columns)).T)
-        self.rows: Tensor
-        self.columns: Tensor
-        self.size = channels * self.rows.shape[0] * self.columns.shape[1]
-
-    def forward(self, deep: Tensor) -> Tensor:
-        """Shape (n, channels, rows, columns) -> (n, size)."""
-        return (self.rows @ deep @ self.columns).flatten(1)
 
 
 class FusedHead(ExportedHead):
@@ -110,9 +92,9 @@ class _DeployedFused(nn.Module):
         super().__init__()
         self.scr, self.head = DeployedScr(head.scr), head
 
-    def forward(self, stem_map: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        points, log_scale, deep = self.scr.maps(stem_map)
-        return points, log_scale, *self.head.regressed(deep)
+    def forward(self, stem_map: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        points, log_scale, deep = self.scr(stem_map)
+        return points, log_scale, *self.head.regressed(deep), deep
 
 
 def _train(lessons: Lessons, config: FusedConfig) -> FusedHead:

@@ -334,23 +334,18 @@ class ScrHead(ExportedHead):
 
 
 class DeployedScr(nn.Module):
-    """``ScrHead`` for the exported graph; ``maps`` also returns the map of the last stage."""
+    """``ScrHead`` for the exported graph."""
 
     def __init__(self, head: ScrHead) -> None:
         super().__init__()
         self.upper = head.upper
         self.network = CellMaps(head.network, head.upper.stem_channels)
 
-    def maps(self, stem_map: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, stem_map: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return coordinates, the logarithms of their scales and the map of the last stage."""
         deep = self.upper.deep(stem_map)
         points, log_scale = self.network(stem_map, deep)
         return points, log_scale, deep
-
-    def forward(self, stem_map: Tensor) -> tuple[Tensor, Tensor]:
-        """Return coordinates and the logarithms of their scales."""
-        points, log_scale, _ = self.maps(stem_map)
-        return points, log_scale
 
 
 def spread_poses(poses: Array, count: int) -> Array:

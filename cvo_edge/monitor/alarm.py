@@ -1,0 +1,158 @@
+"""The alarm without labels: whether the images of a stream are like those of the calibration.
+
+A bundle's graph gives five statistics x of every frame (outputs ``novelty`` and ``degradation``),
+and the bundle their usual values, scales and limits: r = (x - usual) / scale.
+
+``frames``: a frame is beyond if any r exceeds the limit, a conformal quantile of known frames'
+largest r; a new frame of the same recordings is beyond with the stated probability at most. A
+doubt lasts while more than a quarter of the last 32 frames were beyond.
+
+``recordings``: a running statistic M_t = max(0.9 E_t(1/2), E_t(1/10)) of each r must not exceed the
+limit; E_t(a) is the exponentially weighted mean of weight a. Each limit is the largest M_t of all G
+calibrated recordings, so a new recording that is no longer than those raises an alarm at any time
+with probability at most k / (G + 1), with k = 5 statistics: a union of k rank statements.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+from numpy.typing import NDArray
+
+from cvo_edge.bundle.format import DEGRADATION_OUTPUT, NOVELTY_OUTPUT, STATISTICS, AlarmSpec
+from cvo_edge.estimate import Drift, Reason
+
+# Share of known frames beyond the limit of single frames.
+LEVEL = 0.99
+_WEIGHTS, _FACTORS = (0.5, 0.1), (0.9, 1.0)
+# Values count between these, the upper one in limits: neither a clear frame nor a very strange one
+# decides for long what the next frames are taken for.
+_LOWEST, _LARGEST = -1.0, 3.0
+_REMEMBERED, _LEAST, _SHARE = 32, 3, 0.25
+
+
+class Judgement(NamedTuple):
+    """A frame's doubt or None, and its largest statistic as a share of the limit."""
+
+    doubt: Reason | None
+    novelty: float
+
+
+class Running:
+    """The running statistics of one stream: the means of each value, (k,)."""
+
+    def __init__(self, limits: tuple[float, ...]) -> None:
+        self._most = tuple(_LARGEST * limit for limit in limits)
+        self._means: list[tuple[float, ...]] = []
+
+    def add(self, values: list[float]) -> list[float]:
+        """Values r (k,) of the next frame -> M_t (k,)."""
+        kept = tuple(
+            max(_LOWEST, min(value, most)) for value, most in zip(values, self._most, strict=True)
+        )
+        if not self._means:
+            self._means = [kept for _ in _WEIGHTS]
+        self._means = [
+            tuple(mean + weight * (value - mean) for mean, value in zip(means, kept, strict=True))
+            for weight, means in zip(_WEIGHTS, self._means, strict=True)
+        ]
+        scaled = (
+            [factor * mean for mean in means]
+            for factor, means in zip(_FACTORS, self._means, strict=True)
+        )
+        return [max(pair) for pair in zip(*scaled, strict=True)]
+
+
+class StreamAlarm:
+    """Judges the frames of one stream; pass every usable frame once, in order.
+
+    ``spec`` is None for a bundle without an alarm, whose drift is unknown.
+    """
+
+    def __init__(self, spec: AlarmSpec | None) -> None:
+        self._spec = spec
+        self._running = None if spec is None else Running(spec.limits)
+        self._recent: deque[bool] = deque(maxlen=_REMEMBERED)
+        self._since: int | None = None
+        self._reason: Reason | None = None
+
+    def judge(self, outputs: Mapping[str, NDArray[Any]], seq: int) -> Judgement | None:
+        """Judge frame ``seq`` by the model's outputs; None without an alarm."""
+        spec = self._spec
+        if spec is None or self._running is None:
+            return None
+        values = values_of(outputs, spec)
+        if spec.kind == "recordings":
+            values = self._running.add(values)
+        shares = [value / limit for value, limit in zip(values, spec.limits, strict=True)]
+        # Written so that NaN is beyond.
+        largest = max(shares) if all(map(math.isfinite, shares)) else math.inf
+        beyond = not largest <= 1.0
+        lasting = False
+        if spec.kind == "frames":
+            self._recent.append(beyond)
+            count = sum(self._recent)
+            lasting = count >= max(_LEAST, _SHARE * len(self._recent))
+        if beyond:
+            degraded = largest in shares and shares.index(largest) == len(shares) - 1
+            self._reason = Reason.IMAGE_DEGRADED if degraded else Reason.IMAGE_UNFAMILIAR
+        if not (beyond or lasting):
+            self._reason = self._since = None
+        elif self._since is None:
+            self._since = seq
+        return Judgement(self._reason, largest)
+
+    @property
+    def drift(self) -> Drift:
+        """What the stream has come to."""
+        if self._spec is None:
+            return Drift("unknown")
+        state: Literal["clear", "alarm"] = "clear" if self._reason is None else "alarm"
+        return Drift(state, self._reason, self._since, false_alarms(self._spec))
+
+
+def values_of(outputs: Mapping[str, NDArray[Any]], spec: AlarmSpec) -> list[float]:
+    """Return r (k,) of one frame."""
+    statistics = [
+        *outputs[NOVELTY_OUTPUT].ravel().tolist(),
+        *outputs[DEGRADATION_OUTPUT].ravel().tolist(),
+    ]
+    return [
+        (value - usual) / scale
+        for value, usual, scale in zip(statistics, spec.usual, spec.scales, strict=True)
+    ]
+
+
+def rank(n: int) -> int:
+    """Return the rank among n known frames that is the limit of single frames."""
+    return min(math.ceil(LEVEL * (n + 1)), n)
+
+
+def false_alarms(spec: AlarmSpec) -> float:
+    """Return the bound of the probability of a false alarm; 1 if nothing is bounded."""
+    if spec.kind == "frames":
+        return 1.0 - rank(spec.n) / (spec.n + 1)
+    return min(1.0, len(STATISTICS) / (spec.n + 1))
+
+
+def alarm_statement(spec: AlarmSpec | None) -> str:
+    """Return in a sentence what is known of the alarm's false alarms."""
+    if spec is None:
+        return "none: the graph has no outputs novelty and degradation; drift is unknown"
+    bound = false_alarms(spec)
+    if spec.kind == "frames":
+        return (
+            f"a new frame of the calibrated recordings is beyond the limits with probability at "
+            f"most {bound:.2g}, from {spec.n} frames"
+        )
+    if bound >= 1.0:
+        return (
+            f"{spec.n} recordings bound no rate of false alarms; more than {len(STATISTICS)} would"
+        )
+    return (
+        f"a new recording, no longer than the {spec.n} calibrated ones, has a false alarm with "
+        f"probability at most {bound:.2g}"
+    )

@@ -1,0 +1,84 @@
+"""All checks of one stream, in the order in which they speak."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from cvo_edge.bundle.format import AlarmSpec
+from cvo_edge.camera_check import LensEstimate
+from cvo_edge.engine.observation import Observation, Observer
+from cvo_edge.estimate import Drift, Reason
+from cvo_edge.input.frame import Frame
+from cvo_edge.input.frame_checks import StreamChecks
+from cvo_edge.monitor.alarm import StreamAlarm
+
+
+class Verdict(NamedTuple):
+    """Why a frame has no interval, empty if it has one; the alarm's state and the novelty."""
+
+    doubts: tuple[Reason, ...]
+    drift: Drift
+    novelty: float | None
+
+
+class StreamWatch:
+    """Watches one stream; pass every frame once, in order.
+
+    Parameters
+    ----------
+    observer
+        The observer of the stream's frames.
+    alarm
+        The limits of the bundle's alarm, or None.
+    """
+
+    def __init__(self, observer: Observer, alarm: AlarmSpec | None) -> None:
+        self._checks = StreamChecks()
+        self._sizes = observer.stream_sizes()
+        self._camera = observer.camera_check()
+        self._alarm = StreamAlarm(alarm)
+
+    def judge(self, observation: Observation, seq: int, frame: Frame, age_ms: float) -> Verdict:
+        """Judge a frame by its own doubts and by the stream; ``age_ms`` is the frame's age."""
+        own = observation.doubt, observation.fault
+        doubts = tuple(reason for reason in own if reason is not None)
+        doubts += self._sizes.doubts(observation.look)
+        doubts += self._checks.doubts(
+            observation.look, frame.stamp_ns, age_ms, frame.fresh_noise, frame.moving
+        )
+        if self._camera_differs(observation, doubts):
+            doubts += (Reason.CAMERA_DIFFERS,)
+        judged = None
+        # What another check of the image explains says nothing of the place.
+        if observation.fault is None and observation.doubt in (None, Reason.IMAGE_UNFAMILIAR):
+            judged = self._alarm.judge(observation.outputs, seq)
+        if judged is None:
+            return Verdict(doubts, self.drift, None)
+        if judged.doubt is not None and judged.doubt not in doubts:
+            doubts += (judged.doubt,)
+        return Verdict(doubts, self.drift, judged.novelty)
+
+    def _camera_differs(self, observation: Observation, doubts: tuple[Reason, ...]) -> bool:
+        """Pass a frame to the camera check, unless something else is wrong with it."""
+        if self._camera is None or doubts not in ((), (Reason.IMAGE_UNFAMILIAR,)):
+            return False
+        return self._camera.differs(observation.outputs, familiar=not doubts)
+
+    def remarks(self, observation: Observation) -> tuple[Reason, ...]:
+        """Return what is worth knowing of a frame that has an interval."""
+        return self._sizes.remarks(observation.look)
+
+    @property
+    def unproven(self) -> int:
+        """Frames whose equal parts prove no repetition; see ``Odometer.unproven_frames``."""
+        return self._checks.unproven
+
+    @property
+    def drift(self) -> Drift:
+        """Whether the stream's images are still like those of the calibration."""
+        return self._alarm.drift
+
+    @property
+    def seen_camera(self) -> LensEstimate | None:
+        """The camera that the frames show; see ``Odometer.seen_camera``."""
+        return None if self._camera is None else self._camera.estimate()
