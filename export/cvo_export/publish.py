@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -141,9 +141,9 @@ class _Deployed(nn.Module):
     def forward(self, image: torch.Tensor, *extra: torch.Tensor) -> tuple[torch.Tensor, ...]:
         features = self.backbone(image)
         outputs = self.head(features, *extra)
-        if isinstance(self.backbone, Backbone):
-            cells = self.backbone.cells(features)
-        elif self.pooled is not None:
+        if self.pooled is None:
+            cells = cast("Backbone", self.backbone).cells(features)
+        else:
             *outputs, deep = outputs
             cells = self.pooled.cells(deep)
         some = slice(SAMPLE_STEP // 2, None, SAMPLE_STEP)

@@ -42,6 +42,9 @@ class Thumbnail(nn.Module):
     def forward(self, image):
         return avg_pool2d(image.permute(0, 3, 1, 2) / 127.5 - 1.0, 8).flatten(1)
 
+    def cells(self, features):
+        return features.unflatten(1, (3, -1)).transpose(1, 2)
+
 
 @pytest.fixture(scope="module", autouse=True)
 def _small_backbone():
