@@ -451,9 +451,8 @@ def test_the_mean_of_many_passes_is_the_network_itself():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"augmentation": "labels", "passes": 2},
+        {"augmentation": "labels", "passes": 2, "kappa": 1.3, "components": 0},
         {"scale": "constant", "residuals": "held_out"},
-        {"kappa": 1.3, "components": 0},
     ],
 )
 def test_other_regions_train_and_publish(tmp_path, changes):
