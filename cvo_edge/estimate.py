@@ -336,9 +336,12 @@ def _recorded_drift(
 ) -> tuple[float | UnsetType | None, Literal["clear", "alarm"] | UnsetType]:
     if drift.state == "unknown":
         return UNSET, UNSET
-    if novelty is None or not math.isfinite(novelty):
-        return None, drift.state
-    return round(novelty, 4), drift.state
+    return recorded_novelty(novelty), drift.state
+
+
+def recorded_novelty(novelty: float | None) -> float | None:
+    """Return the novelty as a record gives it: four digits, None if it is not a finite number."""
+    return None if novelty is None or not math.isfinite(novelty) else round(novelty, 4)
 
 
 def _null_infinite(values: Iterable[float]) -> tuple[Any, ...]:

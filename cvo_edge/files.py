@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import glob
 import io
 import os
 import stat
@@ -176,3 +177,17 @@ def own_folder(variable: str, base_variable: str, base: str) -> Path:
     except RuntimeError:
         # The user has no home folder: return a path that cannot be created.
         return Path(os.devnull) / "cvo-edge"
+
+
+def refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
+    """Raise UsageError if the output is an input, or lies in an input's folder or glob."""
+    written = Path(output)
+    if output == "-" or not os.path.exists(written):  # noqa: PTH110 - also of a name too long
+        return
+    for given in inputs:
+        if given is None:
+            continue
+        name = str(given)
+        files = [name, *glob.iglob(name, recursive=True), *glob.iglob(f"{glob.escape(name)}/*")]
+        if any(os.path.exists(file) and written.samefile(file) for file in files):  # noqa: PTH110
+            raise UsageError(f"output: expected a new file, found {output} among the inputs")

@@ -194,11 +194,13 @@ class CalibrationSpec(_Strict, frozen=True, omit_defaults=True):
     crossed: Annotated[int, Meta(ge=2, le=10**9)] | None = None
 
 
-class AlarmSpec(_Strict, frozen=True):
+class AlarmSpec(_Strict, frozen=True, omit_defaults=True):
     """Usual values, scales and limits of the five statistics of a frame, see ``STATISTICS``.
 
     ``kind``: whether single frames or running statistics of recordings are limited; ``n``: how many
     frames or recordings the limits come from. ``limits`` are in units of ``scales``.
+    ``recordings``: the mean novelty of each calibration recording, as records would give it with
+    limits from the others; null for single frames, one recording, and in earlier bundles.
     """
 
     kind: Literal["frames", "recordings"]
@@ -206,6 +208,7 @@ class AlarmSpec(_Strict, frozen=True):
     scales: FivePositive
     limits: FivePositive
     n: Annotated[int, Meta(ge=1, le=10**9)]
+    recordings: tuple[Number, ...] | None = None
 
 
 class SelfTest(_Strict, frozen=True):

@@ -53,6 +53,7 @@ def check_rules(calibration: Calibration) -> None:
     _check_crossed(calibration)
     _check_model(calibration)
     _check_images(calibration)
+    _check_alarm(calibration)
 
 
 def _check_crossed(calibration: Calibration) -> None:
@@ -138,11 +139,6 @@ def _check_model(calibration: Calibration) -> None:
         names = [spec.name for spec in tensors]
         if len(set(names)) != len(names):
             raise CalibrationFileError(f"model: expected unique tensor names, found {shown(names)}")
-    outputs = {spec.name for spec in model.outputs}
-    if calibration.alarm is not None and not outputs >= FAMILIARITY.keys():
-        raise CalibrationFileError(
-            "alarm: expected null for a model without outputs novelty and degradation, found limits"
-        )
     sizes = {spec.name: math.prod(spec.shape) for spec in model.outputs}
     given = {name: len(values) for name, values in calibration.selftest.outputs.items()}
     if sizes != given:
@@ -160,4 +156,22 @@ def _check_images(calibration: Calibration) -> None:
         raise CalibrationFileError(
             f"images: expected the size of camera, {camera.width}x{camera.height}, found "
             f"{images.width}x{images.height}"
+        )
+
+
+def _check_alarm(calibration: Calibration) -> None:
+    """Check that the model tells of what the alarm limits, and how many recordings there were."""
+    alarm = calibration.alarm
+    if alarm is None:
+        return
+    if not {spec.name for spec in calibration.model.outputs} >= FAMILIARITY.keys():
+        raise CalibrationFileError(
+            "alarm: expected null for a model without outputs novelty and degradation, found limits"
+        )
+    if alarm.recordings is None:
+        return
+    if alarm.kind != "recordings" or len(alarm.recordings) != alarm.n:
+        raise CalibrationFileError(
+            f"alarm.recordings: expected one number for each of the {alarm.n} recordings, and null "
+            f"for single frames; found {len(alarm.recordings)} with {alarm.kind}"
         )

@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-import glob
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from cvo_edge.errors import GateError, SinkError, SourceError, UsageError
-from cvo_edge.files import write_text
+from cvo_edge.files import refuse_overwriting, write_text
 from cvo_edge.process import guarded, say
 from cvo_edge.programs.options import (
     INTERVALS,
     REPORT,
-    RUNTIME,
     BundleArgument,
     CacheOption,
     CameraOption,
     ExpectMotionOption,
+    FormatOption,
     GroundTruthOption,
+    JsonFileOption,
     JsonOption,
     LabelDelayOption,
     LabelsOption,
     MaxFramesOption,
+    ModeOption,
+    OutputOption,
     PublicKeyOption,
     RegionOption,
     StateOption,
@@ -33,7 +34,7 @@ from cvo_edge.programs.options import (
     TimeoutOption,
     examples,
 )
-from cvo_edge.vocabulary import Format, Mode, Scope
+from cvo_edge.vocabulary import Mode, Scope
 
 if TYPE_CHECKING:
     from cvo_edge.engine.model_cache import ModelCache
@@ -85,19 +86,8 @@ def run(
             show_default=False,
         ),
     ],
-    output: Annotated[
-        str,
-        typer.Option("-o", "--output", help="File, or - for stdout.", rich_help_panel=REPORT),
-    ] = "-",
-    format: Annotated[
-        Format | None,
-        typer.Option(
-            help="Format of the records; default: by the file's suffix (.jsonl, .csv, .tum), else "
-            "jsonl.",
-            show_default=False,
-            rich_help_panel=REPORT,
-        ),
-    ] = None,
+    output: OutputOption = "-",
+    format: FormatOption = None,
     region: RegionOption = False,
     ground_truth: GroundTruthOption = None,
     quiet: Annotated[
@@ -126,17 +116,7 @@ def run(
     expect_motion: ExpectMotionOption = False,
     max_frames: MaxFramesOption = None,
     timeout: TimeoutOption = 5.0,
-    mode: Annotated[
-        Mode | None,
-        typer.Option(
-            metavar="<mode>",
-            help="live: newest frame, least processor time; latency: every frame, each as fast as "
-            "possible; throughput: most frames per second. Default: live for a camera, else "
-            "latency.",
-            show_default=False,
-            rich_help_panel=RUNTIME,
-        ),
-    ] = None,
+    mode: ModeOption = None,
     threads: ThreadsOption = None,
     cache: CacheOption = True,
     public_key: PublicKeyOption = None,
@@ -157,7 +137,7 @@ def run(
     if label_delay and labels is None:
         raise UsageError("--label-delay: expected --labels FILE with it, found no labels")
     written_as = format_of(output, format)
-    _refuse_overwriting(output, source, ground_truth, bundle, public_key, camera, labels, state)
+    refuse_overwriting(output, source, ground_truth, bundle, public_key, camera, labels, state)
     truth = open_ground_truth(ground_truth) if ground_truth else None
     labelled = open_ground_truth(labels) if labels else None
     frames = open_source(source, fps, timeout)
@@ -231,12 +211,7 @@ def bench(
     ] = "latency",
     threads: ThreadsOption = None,
     cache: CacheOption = True,
-    json_file: Annotated[
-        str | None,
-        typer.Option(
-            "--json", help="Write the report as JSON to a file or -.", rich_help_panel=REPORT
-        ),
-    ] = None,
+    json_file: JsonFileOption = None,
     max_p95_ms: Annotated[
         float | None,
         typer.Option(help="Exit 8 if the total's p95 is longer.", rich_help_panel="Gates"),
@@ -250,7 +225,7 @@ def bench(
     from cvo_edge.programs.bench import benchmark, benchmark_lines
 
     if json_file is not None:
-        _refuse_overwriting(json_file, source, bundle)
+        refuse_overwriting(json_file, source, bundle)
     report = benchmark(
         bundle,
         source,
@@ -269,6 +244,45 @@ def bench(
         raise GateError(f"bench: expected p95 of at most {max_p95_ms:g} ms, found {p95:.3f} ms")
     if max_rss_mib is not None and not rss <= max_rss_mib:
         raise GateError(f"bench: expected peak memory of at most {max_rss_mib:g} MiB, found {rss}")
+
+
+@app.command(
+    epilog=examples(
+        "cvo-edge drift my-bundle monday.jsonl tuesday.jsonl wednesday.jsonl",
+        "cvo-edge drift my-bundle *.jsonl --max-martingale 20",
+    )
+)
+def drift(
+    bundle: BundleArgument,
+    records: Annotated[
+        list[Path],
+        typer.Argument(
+            help="JSON lines of run, one file per recording, oldest first.",
+            readable=False,
+            show_default=False,
+        ),
+    ],
+    as_json: JsonOption = False,
+    max_martingale: Annotated[
+        float | None,
+        typer.Option(help="Exit 8 if the martingale was ever larger.", rich_help_panel="Gates"),
+    ] = None,
+) -> None:
+    """Tell whether recordings are still like those that the bundle was calibrated on."""
+    import msgspec
+
+    from cvo_edge.programs.drift import drift_lines, drift_of
+
+    report = drift_of(bundle, records)
+    if as_json:
+        print(json.dumps(msgspec.to_builtins(report), indent=1))
+    else:
+        print(*drift_lines(report), sep="\n")
+    if max_martingale is not None and not report.largest <= max_martingale:
+        raise GateError(
+            f"drift: expected a martingale of at most {max_martingale:g}, found "
+            f"{report.largest:.4g}"
+        )
 
 
 @app.command()
@@ -378,20 +392,6 @@ def _root(
     ] = False,
 ) -> None:
     """Options that need no command."""
-
-
-def _refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
-    """Raise UsageError if the output is an input, or lies in an input's folder or glob."""
-    written = Path(output)
-    if output == "-" or not os.path.exists(written):  # noqa: PTH110 - also of a name too long
-        return
-    for given in inputs:
-        if given is None:
-            continue
-        name = str(given)
-        files = [name, *glob.iglob(name, recursive=True), *glob.iglob(f"{glob.escape(name)}/*")]
-        if any(os.path.exists(file) and written.samefile(file) for file in files):  # noqa: PTH110
-            raise UsageError(f"output: expected a new file, found {output} among the inputs")
 
 
 def main() -> NoReturn:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from cvo_edge.vocabulary import Format, Mode
+
 INTERVALS, RUNTIME, REPORT = "Intervals", "Runtime", "Output"
 ADAPTATION = "Adaptation"
 # A thousand years of a camera.
@@ -64,6 +66,29 @@ ExpectMotionOption = Annotated[
         "--expect-motion",
         help="The camera always moves: a picture that stands still is a doubt.",
         rich_help_panel="Input",
+    ),
+]
+OutputOption = Annotated[
+    str,
+    typer.Option("-o", "--output", help="File, or - for stdout.", rich_help_panel=REPORT),
+]
+FormatOption = Annotated[
+    Format | None,
+    typer.Option(
+        help="Format of the records; default: by the file's suffix (.jsonl, .csv, .tum), else "
+        "jsonl.",
+        show_default=False,
+        rich_help_panel=REPORT,
+    ),
+]
+ModeOption = Annotated[
+    Mode | None,
+    typer.Option(
+        metavar="<mode>",
+        help="live: newest frame, least processor time; latency: every frame, each as fast as "
+        "possible; throughput: most frames per second. Default: live for a camera, else latency.",
+        show_default=False,
+        rich_help_panel=RUNTIME,
     ),
 ]
 RegionOption = Annotated[
@@ -132,3 +157,7 @@ StateOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+JsonFileOption = Annotated[
+    str | None,
+    typer.Option("--json", help="Write the report as JSON to a file or -.", rich_help_panel=REPORT),
+]

@@ -11,6 +11,7 @@ from scipy.spatial.distance import cdist, mahalanobis
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
+from cvo_edge.monitor.alarm import StreamAlarm
 from cvo_export.bundles.alarm import Statistics, fitted_alarm
 from cvo_export.data.harmless import HARMLESS
 from cvo_export.graph import familiarise
@@ -151,7 +152,20 @@ def test_limits_of_recordings_are_their_largest_running_values():
     both = [Statistics(generator.normal(size=(180, 5)), sequence) for _ in range(4)]
     spec = fitted_alarm("sequence", (both[0], both[1]), (both[2], both[3]))
     assert (spec.kind, spec.n) == ("recordings", 6)
+    assert spec.recordings is not None
+    for number, mean in enumerate(spec.recordings):
+        # What the records of a new recording would give, of a bundle that never saw it.
+        own, others = (
+            [Statistics(each.values[rows], each.sequence[rows]) for each in both[2:]]
+            for rows in (sequence == number, sequence != number)
+        )
+        alarm = StreamAlarm(fitted_alarm("sequence", (both[0], both[1]), (others[0], others[1])))
+        outputs = ({"novelty": row[:4], "degradation": row[4:]} for row in own[0].values)
+        novelties = [alarm.judge(each, seq).novelty for seq, each in enumerate(outputs)]
+        assert mean == pytest.approx(np.mean(novelties), abs=1e-4)
+    one = fitted_alarm("sequence", (both[0], both[1]), (own[0], own[1]))
+    assert one.recordings is None
     single = fitted_alarm("random", (both[0], both[1]), (both[2], both[3]))
     r = (both[2].values - np.array(single.usual)) / np.array(single.scales)
-    assert single.kind == "frames"
+    assert (single.kind, single.recordings) == ("frames", None)
     assert np.mean(r.max(axis=1) > single.limits[0]) <= 0.01

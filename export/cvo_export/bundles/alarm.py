@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import (
@@ -17,7 +18,9 @@ from cvo_edge.bundle.format import (
     Five,
     SplitSpec,
 )
-from cvo_edge.monitor.alarm import Running, rank
+from cvo_edge.estimate import recorded_novelty
+from cvo_edge.monitor.alarm import Running, StreamAlarm, rank
+from cvo_edge.monitor.martingale import mean_novelty
 from cvo_edge.vocabulary import SplitKind
 from cvo_export.data.harmless import harmlessly_changed
 from cvo_export.datasets import PoseDataset
@@ -112,8 +115,12 @@ def fitted_alarm(
     if kind == "frames":
         limits, n = _frame_limits(clean, changed), len(clean.values)
     else:
-        limits, n = _recording_limits(clean, changed)
-    return AlarmSpec(kind=kind, usual=_five(usual), scales=_five(scales), limits=_five(limits), n=n)
+        largest = _largest(clean, changed)
+        limits, n = _recording_limits(largest), len(largest)
+    spec = AlarmSpec(kind=kind, usual=_five(usual), scales=_five(scales), limits=_five(limits), n=n)
+    if kind == "recordings" and n > 1:
+        return replace(spec, recordings=_novelties(spec, largest, cal[0]))
+    return spec
 
 
 def _frame_limits(clean: Statistics, changed: Statistics) -> Array:
@@ -127,15 +134,44 @@ def _frame_limits(clean: Statistics, changed: Statistics) -> Array:
     return np.full(len(STATISTICS), limit)
 
 
-def _recording_limits(clean: Statistics, changed: Statistics) -> tuple[Array, int]:
-    """Return the largest running statistic of any recording, and the number of recordings."""
-    numbers = np.unique(clean.sequence)
-    largest = [
-        _running(each.values[each.sequence == number])
-        for each in (clean, changed)
-        for number in np.unique(each.sequence)
-    ]
-    return np.maximum(np.max(largest, axis=0), _LEAST_LIMIT), len(numbers)
+def _largest(clean: Statistics, changed: Statistics) -> Array:
+    """Return the largest running statistics of each recording and its copies, (G, 5)."""
+    return np.array(
+        [
+            np.max(
+                [
+                    _running(each.values[each.sequence == number])
+                    for each in (clean, changed)
+                    if number in each.sequence
+                ],
+                axis=0,
+            )
+            for number in np.unique(clean.sequence)
+        ]
+    )
+
+
+def _recording_limits(largest: Array) -> Array:
+    return np.asarray(np.maximum(np.max(largest, axis=0), _LEAST_LIMIT))
+
+
+def _novelties(spec: AlarmSpec, largest: Array, known: Statistics) -> tuple[float, ...]:
+    """Return the mean novelty of each recording as the runtime would record it, were it new.
+
+    That is, with limits from the others: its own would make it look more familiar than a new one.
+    """
+    means = []
+    for index, number in enumerate(np.unique(known.sequence)):
+        limits = _recording_limits(np.delete(largest, index, axis=0))
+        alarm = StreamAlarm(replace(spec, limits=_five(limits)))
+        judged = (
+            alarm.judge({NOVELTY_OUTPUT: row[:-1], DEGRADATION_OUTPUT: row[-1:]}, seq)
+            for seq, row in enumerate(known.values[known.sequence == number])
+        )
+        _, mean = mean_novelty(each and recorded_novelty(each.novelty) for each in judged)
+        if mean is not None:
+            means.append(mean)
+    return tuple(means)
 
 
 def _running(values: Array) -> Array:

@@ -1,0 +1,134 @@
+"""The command ``drift``: whether recordings are still like those of the calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from msgspec import UNSET, Struct
+
+from cvo_edge.bundle.format import Calibration
+from cvo_edge.bundle.reading import read_calibration
+from cvo_edge.errors import BundleMismatchError, CalibrationFileError, SourceError, printable
+from cvo_edge.monitor.martingale import ALARM, RecordingMartingale, mean_novelty
+from cvo_edge.output.records import Header, read_records
+
+
+class Recording(Struct, frozen=True):
+    """One file of records: frames, those judged by the alarm, and what they come to.
+
+    Without a judged frame, the last four are None or as before: nothing was bet on it.
+    """
+
+    file: str
+    frames: int
+    judged: int
+    novelty: float | None
+    p: float | None
+    martingale: float
+    alarm: bool
+
+
+class DriftReport(Struct, frozen=True):
+    """All recordings in the order given, and what they were compared with."""
+
+    bundle: str
+    digest: str
+    calibration_recordings: int
+    alarm_at: float
+    recordings: tuple[Recording, ...]
+
+    @property
+    def largest(self) -> float:
+        """The largest capital, at least 1."""
+        return max((1.0, *(each.martingale for each in self.recordings)))
+
+
+def drift_of(bundle: str | Path, files: Sequence[str | Path]) -> DriftReport:
+    """Compare recordings (files of JSON Lines) with those that the bundle was calibrated on.
+
+    Raises
+    ------
+    CalibrationFileError
+        The bundle cannot be read, or has no calibration recordings to compare with.
+    BundleMismatchError
+        Records of another bundle.
+    SourceError
+        A file cannot be read, or does not say of which bundle its records are.
+    """
+    calibration = read_calibration(bundle)
+    reference = _reference(calibration)
+    martingale = RecordingMartingale(reference)
+    recordings, capital, alarm = [], 1.0, False
+    for file in files:
+        novelties = list(_novelties(file, calibration))
+        judged, novelty = mean_novelty(novelties)
+        p = None
+        if novelty is not None:
+            p, capital, alarm = martingale.add(novelty)
+        recordings.append(Recording(str(file), len(novelties), judged, novelty, p, capital, alarm))
+    return DriftReport(
+        calibration.name, calibration.digest, len(reference), ALARM, tuple(recordings)
+    )
+
+
+def _reference(calibration: Calibration) -> tuple[float, ...]:
+    alarm = calibration.alarm
+    if alarm is not None and alarm.recordings is not None:
+        return alarm.recordings
+    if alarm is None:
+        found = "a bundle without an alarm"
+    elif alarm.kind == "frames":
+        found = "an alarm of single frames"
+    else:
+        found = "an alarm of a single recording or of an earlier release"
+    raise CalibrationFileError(
+        f"{calibration.name}: expected the novelty of each calibration recording "
+        f"(alarm.recordings), found {found}; publish a run with a split by sequence"
+    )
+
+
+def _novelties(file: str | Path, calibration: Calibration) -> Iterator[float | None]:
+    """Yield the novelty of each frame, None if it was not judged."""
+    records = read_records(file)
+    checked = _checked(records.header, file, calibration)
+    for record in records:
+        if records.header is not checked:
+            checked = _checked(records.header, file, calibration)
+        yield None if record.novelty is UNSET else record.novelty
+
+
+def _checked(header: Header | None, file: str | Path, calibration: Calibration) -> Header:
+    name = printable(str(file))
+    if header is None:
+        raise SourceError(f"{name}: expected a header that names the bundle, found none")
+    if header.digest != calibration.digest:
+        raise BundleMismatchError(
+            f"{name}: expected records of {calibration.name} ({calibration.digest[:16]}), found "
+            f"records of {printable(header.bundle)} ({printable(header.digest[:16])})"
+        )
+    return header
+
+
+def drift_lines(report: DriftReport) -> list[str]:
+    """Return the report as lines of readable text."""
+    lines = [
+        f"compared with {report.calibration_recordings} calibration recordings of {report.bundle}",
+        f"{'frames':>8}{'judged':>8}{'novelty':>9}{'p':>8}{'martingale':>12}  recording",
+    ]
+    for each in report.recordings:
+        novelty = "-" if each.novelty is None else f"{each.novelty:.4f}"
+        p = "-" if each.p is None else f"{each.p:.4f}"
+        lines.append(
+            f"{each.frames:>8}{each.judged:>8}{novelty:>9}{p:>8}{each.martingale:>12.4g}  "
+            f"{printable(each.file)}{'  alarm' if each.alarm else ''}"
+        )
+    if not any(each.alarm for each in report.recordings):
+        return [*lines, f"clear: the martingale stayed below {report.alarm_at:g}"]
+    first = next(each for each in report.recordings if each.alarm)
+    return [
+        *lines,
+        f"alarm: the martingale passed {report.alarm_at:g} at {printable(first.file)}; while "
+        f"recordings are like the calibrated ones, it ever does with probability at most "
+        f"{1.0 / report.alarm_at:g}",
+    ]
