@@ -114,20 +114,23 @@ class Repetition:
     def _loops(self, squares: Numbers, thumbnail: Numbers) -> bool:
         if len(squares) == 0 or not self._moved(thumbnail):
             return False
-        # By lag, the newest frame last, which is a lag of 1. In a loop, the lag stays the same.
-        by_lag = np.full(FRAMES, np.inf, np.float32)
-        by_lag[-len(squares) :] = squares
-        self._moving.append(by_lag)
-        if len(self._moving) < _IN_ORDER:
+        self._moving.append(squares)
+        noise = _IN_ORDER * _STILL**2 * (thumbnail.size - 1)
+        old = squares[: 1 - _SHORTEST_LOOP]
+        # A sum within the noise has no part beyond it.
+        if len(self._moving) < _IN_ORDER or len(old) == 0 or old.min() >= noise:
             return False
-        total = np.sum(self._moving, axis=0)
+        # By lag, the newest frame last, which is a lag of 1. In a loop, the lag stays the same.
+        by_lag = np.full((_IN_ORDER, FRAMES), np.inf, np.float32)
+        for row, distances in zip(by_lag, self._moving, strict=True):
+            row[-len(distances) :] = distances
+        total = by_lag.sum(axis=0)
         moved = float(total[-1])
         # From the second frame on that is compared with all of them: the first has none before it.
         oldest = int(np.isfinite(total).argmax()) + 1
         if oldest > FRAMES - _SHORTEST_LOOP:
             return False
         nearest = oldest + int(total[oldest : 1 - _SHORTEST_LOOP].argmin())
-        noise = _IN_ORDER * _STILL**2 * (thumbnail.size - 1)
         near = total[nearest] < min(noise, _NEAR**2 * moved)
         same = abs(total[nearest - 1] - moved) < _SAME * moved
         oscillates = total[1 - _SHORTEST_LOOP : -1].min() < _NEARER**2 * moved
