@@ -230,6 +230,9 @@ class StampingDriver:
     def open(self, device):
         return True
 
+    def set(self, name, value):
+        return True
+
     def get(self, name):
         return 1e3 * self._stamp_s
 
