@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,9 +15,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.estimate import PoseInterval
+from cvo_edge.output.drawing import (
+    BITS,
+    SCALE,
+    Colour,
+    draw_cross,
+    draw_dot,
+    draw_line,
+    draw_ring,
+    draw_swatch,
+    draw_text,
+    fixed,
+)
 
 Array = NDArray[np.float64]
-Colour = tuple[int, int, int]
 
 WIDTH, HEIGHT = 1200, 800
 
@@ -28,17 +40,21 @@ _OUTLINE: Colour = (233, 180, 86)
 _MISSED: Colour = (0, 94, 213)
 _MISSED_INTERVAL: Colour = (150, 205, 248)
 _NOTHING: Colour = (225, 225, 225)
+_MARKED: Colour = (167, 121, 204)
 _GRID: Colour = (232, 232, 232)
 _FRAME: Colour = (150, 150, 150)
-_TEXT: Colour = (60, 60, 60)
 
-# Everything is drawn at twice the size, to a sixteenth of a pixel, and then halved.
-_SCALE, _BITS = 2, 4
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_SAMPLE = "truth inside in 50 of 50 frames"
 _UNITS = (100.0,) * 3 + (math.degrees(1.0),) * 3
 _OUTLINED = 5
 _PADDING = 0.08
+
+
+class Span(NamedTuple):
+    """Frames to mark, by their positions in the run: the first, the last, and what they show."""
+
+    first: int
+    last: int
+    shows: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +86,14 @@ def draw_run(
     truths: Sequence[ArrayLike | None],
     title: str,
     lines: Sequence[str] = (),
+    span: Span | None = None,
 ) -> NDArray[np.uint8]:
     """Draw a run and its ground truth.
 
     Left: the path in the x-y plane of the world (the view from above if z points up), with the
     boxes of the tx and ty intervals. Right: each DoF *minus the truth* over the frames, in cm and
     deg, so that the zero line is the truth in every chart. Frames without a pose, finite bounds or
-    a true pose are grey columns.
+    a true pose are grey columns, and a grey stretch of the path.
 
     Parameters
     ----------
@@ -85,7 +102,9 @@ def draw_run(
     truths
         True ``T_world_camera`` (7,) of each estimate, or None if it is unknown.
     title, lines
-        A heading and up to two lines below it; printable ASCII only, as OpenCV 4 requires.
+        A heading and up to three lines below it; printable ASCII only, as OpenCV 4 requires.
+    span
+        Frames to mark with a bar.
 
     Returns
     -------
@@ -107,21 +126,23 @@ def draw_run(
         raise UsageError(
             f"picture: none of the {len(estimates)} frames has finite bounds and a true pose"
         )
-    canvas = np.full((_SCALE * HEIGHT, _SCALE * WIDTH, 3), 255, np.uint8)
-    _text(canvas, title, (24, 34), 10.5, bold=True, colour=_TRUTH)
+    canvas = np.full((SCALE * HEIGHT, SCALE * WIDTH, 3), 255, np.uint8)
+    draw_text(canvas, title, (24, 30), 10.5, bold=True, colour=_TRUTH)
     for number, line in enumerate(lines):
-        _text(canvas, line, (24, 58 + 20 * number), 6.5)
-    _path_from_above(canvas, frames)
+        draw_text(canvas, line, (24, 50 + 18 * number), 6.5)
+    _path_from_above(canvas, frames, truths, span)
     names = estimates[0].chart.dof
     for column, heading in enumerate(("Position minus truth (cm)", "Rotation minus truth (deg)")):
         left = 575 + 320 * column
-        _text(canvas, heading, (left, 102), 7.5, bold=True)
+        draw_text(canvas, heading, (left, 105), 7.5, bold=True)
         for row in range(3):
             top = 128 + 211 * row
             panel = (left, top, left + 285, top + 165)
             _error_over_frames(canvas, panel, frames, 3 * column + row, names, len(estimates))
-        _text(canvas, "frame", (left + 142, 748), 6, align=0.5)
-    _legend(canvas, greyed=len(frames) < len(estimates))
+            if span:
+                _bar(canvas, panel, span, len(estimates))
+        draw_text(canvas, "frame", (left + 142, 748), 6, align=0.5)
+    _legend(canvas, greyed=len(frames) < len(estimates), span=span)
     picture = cv2.resize(canvas, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
     # 32 levels per channel look the same and reduce the file by a third.
     return np.asarray(picture // 8 * 8 + picture // 32, np.uint8)
@@ -168,7 +189,7 @@ class _Panel:
         values = np.asarray(points, np.float64)
         x = left + (values[:, 0] - self.x[0]) / (self.x[1] - self.x[0]) * (right - left)
         y = bottom - (values[:, 1] - self.y[0]) / (self.y[1] - self.y[0]) * (bottom - top)
-        return _fixed(np.stack([x, y], axis=1))
+        return fixed(np.stack([x, y], axis=1))
 
     def box(self, x: tuple[float, float], y: tuple[float, float]) -> NDArray[np.int32]:
         """Return the corners of a rectangle of values, cut at the panel's edge."""
@@ -185,21 +206,27 @@ class _Panel:
                 ends = [(self.x[0], value), (self.x[1], value)]
                 if not across:
                     ends = [(value, self.y[0]), (value, self.y[1])]
-                _line(self.canvas, self.at(ends), _GRID, 1.0)
-                x, y = (self.at(ends)[0] / (_SCALE << _BITS)).tolist()
+                draw_line(self.canvas, self.at(ends), _GRID, 1.0)
+                x, y = (self.at(ends)[0] / (SCALE << BITS)).tolist()
                 label = f"{value + 0.0:.{max(0, -math.floor(math.log10(step) + 1e-9))}f}"
                 if across:
-                    _text(self.canvas, label, (x - 6, y + 4), 5.5, align=1.0)
+                    draw_text(self.canvas, label, (x - 6, y + 4), 5.5, align=1.0)
                 else:
-                    _text(self.canvas, label, (x, bottom + 16), 5.5, align=0.5)
+                    draw_text(self.canvas, label, (x, bottom + 16), 5.5, align=0.5)
         corners = [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
-        _line(self.canvas, _fixed(corners), _FRAME, 1.0)
+        draw_line(self.canvas, fixed(corners), _FRAME, 1.0)
 
 
-def _path_from_above(canvas: NDArray[np.uint8], frames: Sequence[_Compared]) -> None:
+def _path_from_above(
+    canvas: NDArray[np.uint8],
+    frames: Sequence[_Compared],
+    truths: Sequence[ArrayLike | None],
+    span: Span | None,
+) -> None:
     """Draw truth, estimates and boxes of tx and ty; both axes have the same scale."""
     boxes = [np.unique(frame.estimate.position_boxes()[:, :2], axis=0) for frame in frames]
-    truth = np.array([frame.truth[:2] for frame in frames])
+    known = {n: np.asarray(pose)[:2] for n, pose in enumerate(truths) if pose is not None}
+    truth = np.array(list(known.values()))
     points = np.array([frame.point[:2] for frame in frames])
     shown = np.concatenate(
         [truth, points, *(each.transpose(0, 2, 1).reshape(-1, 2) for each in boxes)]
@@ -214,29 +241,42 @@ def _path_from_above(canvas: NDArray[np.uint8], frames: Sequence[_Compared]) -> 
     panel = _Panel(canvas, area, (start[0], end[0]), (start[1], end[1]))
     for each in boxes:
         for x, y in each:
-            cv2.fillPoly(canvas, [panel.box(tuple(x), tuple(y))], _INTERVAL, cv2.LINE_8, _BITS)
+            cv2.fillPoly(canvas, [panel.box(tuple(x), tuple(y))], _INTERVAL, cv2.LINE_8, BITS)
     step = _tick_step(float(np.max(end - start)), 8)
     panel.grid(_ticks(panel.x, step), _ticks(panel.y, step))
     every = max(1, len(boxes) // _OUTLINED)
     for each in boxes[::every]:
         for x, y in each:
             corners = panel.box(tuple(x), tuple(y))
-            _line(canvas, np.concatenate([corners, corners[:1]]), _OUTLINE, 1.0)
+            draw_line(canvas, np.concatenate([corners, corners[:1]]), _OUTLINE, 1.0)
+    for number in sorted(known.keys() - {frame.number for frame in frames}):
+        draw_line(canvas, panel.at(_stretch(known, number)), _NOTHING, 14.0)
+    if span:
+        for number in sorted(known.keys() & set(range(span.first, span.last + 1))):
+            draw_line(canvas, panel.at(_stretch(known, number)), _MARKED, 6.0)
     for frame in frames:
         colour = _OUTLINE if frame.covered[:2].all() else _MISSED
-        _line(canvas, panel.at([frame.truth[:2], frame.point[:2]]), colour, 1.0)
-    _line(canvas, panel.at(truth), _TRUTH, 2.0)
+        draw_line(canvas, panel.at([frame.truth[:2], frame.point[:2]]), colour, 1.0)
+    draw_line(canvas, panel.at(truth), _TRUTH, 2.0)
     for place in panel.at(points):
-        _dot(canvas, place, _ESTIMATE)
+        draw_dot(canvas, place, _ESTIMATE)
     missed = [frame.truth[:2] for frame in frames if not frame.covered[:2].all()]
     for place in panel.at(np.reshape(missed, (-1, 2))):
-        _cross(canvas, place, _MISSED)
-    _ring(canvas, panel.at(truth[:1])[0], _TRUTH)
-    _text(canvas, "Path in the x-y plane of the world", (area[0], 102), 7.5, bold=True)
+        draw_cross(canvas, place, _MISSED)
+    draw_ring(canvas, panel.at(truth[:1])[0], _TRUTH)
+    draw_text(canvas, "Path in the x-y plane of the world", (area[0], 105), 7.5, bold=True)
     note = f"outlined: one box in {every}"
-    _text(canvas, note, (area[2], 120), 5.5, align=1.0)
-    _text(canvas, "x (m)", (0.5 * (area[0] + area[2]), 748), 6, align=0.5)
-    _text(canvas, "y (m)", (area[0], 120), 6, align=1.0)
+    draw_text(canvas, note, (area[2], 120), 5.5, align=1.0)
+    draw_text(canvas, "x (m)", (0.5 * (area[0] + area[2]), 748), 6, align=0.5)
+    draw_text(canvas, "y (m)", (area[0], 120), 6, align=1.0)
+
+
+def _stretch(known: dict[int, Array], number: int) -> Array:
+    """Return the part of the path (3, 2) that belongs to a frame: half the way to either side."""
+    here = known[number]
+    sides = (known.get(other, here) for other in (number - 1, number + 1))
+    before, after = (0.5 * (here + side) for side in sides)
+    return np.stack([before, here, after])
 
 
 def _error_over_frames(
@@ -264,47 +304,56 @@ def _error_over_frames(
     drawn = {frame.number for frame in frames}
     for number in set(range(count)) - drawn:
         column = panel.box((number - 0.5, number + 0.5), panel.y)
-        cv2.fillPoly(canvas, [column], _NOTHING, cv2.LINE_AA, _BITS)
+        cv2.fillPoly(canvas, [column], _NOTHING, cv2.LINE_AA, BITS)
     for frame, row in zip(frames, bands, strict=True):
         colour = _INTERVAL if frame.covered[dof] else _MISSED_INTERVAL
         for band in row:
             corners = panel.box((frame.number - 0.5, frame.number + 0.5), band)
             # No anti-aliasing: it would leave seams between neighbours.
-            cv2.fillPoly(canvas, [corners], colour, cv2.LINE_8, _BITS)
+            cv2.fillPoly(canvas, [corners], colour, cv2.LINE_8, BITS)
     panel.grid(
         _ticks(panel.x, _tick_step(count, 6)),
         _ticks(panel.y, _tick_step(panel.y[1] - panel.y[0], 5)),
     )
-    _line(canvas, panel.at([(panel.x[0], 0.0), (panel.x[1], 0.0)]), _TRUTH, 2.0)
+    draw_line(canvas, panel.at([(panel.x[0], 0.0), (panel.x[1], 0.0)]), _TRUTH, 2.0)
     for place in panel.at([(f.number, y) for f, y in zip(frames, error, strict=True)]):
-        _dot(canvas, place, _ESTIMATE)
+        draw_dot(canvas, place, _ESTIMATE)
     missed = [(frame.number, 0.0) for frame in frames if not frame.covered[dof]]
     for place in panel.at(np.reshape(missed, (-1, 2))):
-        _cross(canvas, place, _MISSED)
+        draw_cross(canvas, place, _MISSED)
     covered = len(frames) - len(missed)
-    _text(canvas, names[dof], (area[0], area[1] - 6), 7, bold=True)
+    draw_text(canvas, names[dof], (area[0], area[1] - 6), 7, bold=True)
     note = f"truth inside in {covered} of {len(frames)} frames"
-    _text(canvas, note, (area[2], area[1] - 6), 5.5, align=1.0)
+    draw_text(canvas, note, (area[2], area[1] - 6), 5.5, align=1.0)
 
 
-def _legend(canvas: NDArray[np.uint8], *, greyed: bool) -> None:
+def _bar(
+    canvas: NDArray[np.uint8], area: tuple[int, int, int, int], span: Span, count: int
+) -> None:
+    """Mark frames of a panel at its lower edge."""
+    panel = _Panel(canvas, area, (-0.5, count - 0.5), (0.0, 1.0))
+    corners = panel.box((span.first - 0.5, span.last + 0.5), (0.0, 0.05))
+    cv2.fillPoly(canvas, [corners], _MARKED, cv2.LINE_AA, BITS)
+
+
+def _legend(canvas: NDArray[np.uint8], *, greyed: bool, span: Span | None) -> None:
     y = 774
-    _line(canvas, _fixed([(75, y), (105, y)]), _TRUTH, 2.0)
-    _ring(canvas, _fixed([(75, y)])[0], _TRUTH)
-    _text(canvas, "truth (ring: start)", (113, y + 4), 6)
-    _dot(canvas, _fixed([(255, y)])[0], _ESTIMATE)
-    _text(canvas, "estimate", (266, y + 4), 6)
-    _swatch(canvas, 345, y, _INTERVAL)
-    _text(canvas, "interval that holds the truth", (383, y + 4), 6)
-    _swatch(canvas, 595, y, _MISSED_INTERVAL)
-    _cross(canvas, _fixed([(610, y)])[0], _MISSED)
-    _text(canvas, "truth outside the interval", (633, y + 4), 6)
+    draw_line(canvas, fixed([(75, y), (105, y)]), _TRUTH, 2.0)
+    draw_ring(canvas, fixed([(75, y)])[0], _TRUTH)
+    draw_text(canvas, "truth (ring: start)", (113, y + 4), 6)
+    draw_dot(canvas, fixed([(255, y)])[0], _ESTIMATE)
+    draw_text(canvas, "estimate", (266, y + 4), 6)
+    draw_swatch(canvas, 345, y, _INTERVAL)
+    draw_text(canvas, "interval that holds the truth", (383, y + 4), 6)
+    draw_swatch(canvas, 595, y, _MISSED_INTERVAL)
+    draw_cross(canvas, fixed([(610, y)])[0], _MISSED)
+    draw_text(canvas, "truth outside the interval", (633, y + 4), 6)
     if greyed:
-        _swatch(canvas, 830, y, _NOTHING)
-        _text(canvas, "no interval or no truth", (868, y + 4), 6)
-
-
-# ------------------------------------------------------------------------------------ primitives
+        draw_swatch(canvas, 830, y, _NOTHING)
+        draw_text(canvas, "no interval or no truth", (868, y + 4), 6)
+    if span:
+        draw_swatch(canvas, 1040, y, _MARKED)
+        draw_text(canvas, span.shows, (1078, y + 4), 6)
 
 
 def _tick_step(extent: float, most: int) -> float:
@@ -318,64 +367,3 @@ def _tick_step(extent: float, most: int) -> float:
 def _ticks(bounds: tuple[float, float], step: float) -> Array:
     first, last = math.ceil(bounds[0] / step), math.floor(bounds[1] / step)
     return step * np.arange(first, last + 1, dtype=np.float64)
-
-
-def _fixed(points: ArrayLike) -> NDArray[np.int32]:
-    """Pixels of the picture (n, 2) -> fixed-point pixels of the enlarged canvas."""
-    return np.asarray(np.round(np.asarray(points, np.float64) * (_SCALE << _BITS)), np.int32)
-
-
-def _line(
-    canvas: NDArray[np.uint8], points: NDArray[np.int32], colour: Colour, width: float
-) -> None:
-    cv2.polylines(canvas, [points], False, colour, round(width * _SCALE), cv2.LINE_AA, _BITS)
-
-
-def _dot(canvas: NDArray[np.uint8], place: NDArray[np.int32], colour: Colour) -> None:
-    cv2.circle(
-        canvas, place.tolist(), round(2.5 * _SCALE * (1 << _BITS)), colour, -1, cv2.LINE_AA, _BITS
-    )
-
-
-def _ring(canvas: NDArray[np.uint8], place: NDArray[np.int32], colour: Colour) -> None:
-    reach = 6 * _SCALE << _BITS
-    cv2.circle(canvas, place.tolist(), reach, colour, round(1.5 * _SCALE), cv2.LINE_AA, _BITS)
-
-
-def _cross(canvas: NDArray[np.uint8], place: NDArray[np.int32], colour: Colour) -> None:
-    reach = 4 * _SCALE << _BITS
-    for diagonal in ((reach, reach), (reach, -reach)):
-        _line(canvas, np.stack([place - diagonal, place + diagonal]).astype(np.int32), colour, 2.0)
-
-
-def _swatch(canvas: NDArray[np.uint8], x: float, y: float, colour: Colour) -> None:
-    corners = _fixed([(x, y - 7), (x + 30, y - 7), (x + 30, y + 7), (x, y + 7)])
-    cv2.fillPoly(canvas, [corners], colour, cv2.LINE_AA, _BITS)
-
-
-def _text(
-    canvas: NDArray[np.uint8],
-    text: str,
-    place: tuple[float, float],
-    size: float,
-    *,
-    align: float = 0.0,
-    bold: bool = False,
-    colour: Colour = _TEXT,
-) -> None:
-    """Draw text on a baseline; ``align`` 0 puts ``place`` at its left end, 0.5 middle, 1 right.
-
-    ``size`` is the mean width of a character in pixels, because the fonts of OpenCV 4 and 5 differ
-    in width and must fit the same layout.
-    """
-    thickness = 4 if bold else 2
-    scale = size * _SCALE / _character_width(thickness)
-    width = cv2.getTextSize(text, _FONT, scale, thickness)[0][0]
-    origin = (round(place[0] * _SCALE - align * width), round(place[1] * _SCALE))
-    cv2.putText(canvas, text, origin, _FONT, scale, colour, thickness, cv2.LINE_AA)
-
-
-@cache
-def _character_width(thickness: int) -> float:
-    """Return the mean width of a character at scale 1, in pixels."""
-    return float(cv2.getTextSize(_SAMPLE, _FONT, 1.0, thickness)[0][0]) / len(_SAMPLE)

@@ -1,20 +1,26 @@
-"""The demonstration: run a bundle on the packaged clip, compare with ground truth, and draw it."""
+"""The demonstration: run a bundle on the packaged clip, compare with ground truth, and draw it.
+
+A bundle with an alarm sees the clip twice, the second time with a hand before the lens.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from cvo_edge.errors import UsageError
 from cvo_edge.estimate import PoseInterval
-from cvo_edge.ground_truth import open_ground_truth
+from cvo_edge.ground_truth import GroundTruth, open_ground_truth
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
-from cvo_edge.output.picture import draw_run, write_png
+from cvo_edge.output.picture import Span, draw_run, write_png
 from cvo_edge.output.sinks import Sink
+from cvo_edge.programs.hand import HAND, covered
 from cvo_edge.programs.run import RunSummary, run
 from cvo_edge.programs.verify import verify_bundle
 from cvo_edge.vocabulary import Scope
@@ -25,12 +31,15 @@ BUNDLE, CLIP, EXPECTED = (PACKAGED / n for n in ("bundle", "clip", "expected_cov
 _CONFIDENCE = 0.9
 _SCOPE: Scope = "marginal"
 _ROWS = 4
+_FRAMES = f"{HAND.start} to {HAND.stop - 1}"
+_HAND = f"a hand before the lens in frames {_FRAMES}"
 
 
 def demo(bundle: Path, picture: Path) -> None:
     """Verify a bundle, run it on the packaged clip, print the results and draw them as PNG.
 
-    Results go to standard output; the last line is the path of the picture.
+    Results go to standard output; the last line is the path of the picture, which shows the run
+    with the hand if there is one.
 
     Raises
     ------
@@ -61,18 +70,85 @@ def demo(bundle: Path, picture: Path) -> None:
             estimates.append(estimate)
 
         run(odometer, open_source(str(CLIP)), write, summary=summary, truth=truth)
-    expected = expected_coverage(digest)
-    print("...", *summary.lines(), sep="\n")
-    if expected:
-        print(fill(expected, 80, initial_indent="expected    ", subsequent_indent=" " * 12))
+        expected = expected_coverage(digest)
+        print("...", *summary.lines(), sep="\n")
+        if expected:
+            print(_indented("expected", expected))
+        notes = [_found(summary), f"Expected: {expected}" if expected else ""]
+        span = None
+        if odometer.calibration.alarm is None:
+            print(_indented("hand", "not shown: it takes an alarm, and this bundle has none"))
+        else:
+            estimates, told = _with_hand(odometer, estimates, truth, table)
+            notes = [f"Without the hand: {note}" for note in notes[:1] if note] + notes[1:]
+            notes = [*filter(None, notes), f"With {_HAND}: {told}."]
+            span = Span(HAND.start, HAND.stop - 1, "hand")
     drawn = draw_run(
         estimates,
         [truth.pose_of(estimate) for estimate in estimates],
         f"{name}: each interval holds the truth with probability {_CONFIDENCE:g}",
-        [_found(summary), f"Expected: {expected}" if expected else ""],
+        notes,
+        span,
     )
     write_png(picture, drawn)
     print(picture)
+
+
+def _with_hand(
+    odometer: Odometer, plain: Sequence[PoseInterval], truth: GroundTruth, table: Sink
+) -> tuple[list[PoseInterval], str]:
+    """Run the clip with a hand, and print what happens; ``plain`` are the estimates without it.
+
+    Returns the estimates, and what happened in words.
+    """
+    print(_indented("hand", f"the clip again, with {_HAND}:"), flush=True)
+    estimates = list(odometer.stream(covered(open_source(str(CLIP)))))
+    for number in _turns(estimates):
+        table.write(estimates[number])
+    told = what_happened(estimates)
+    worst, usual = (_worst_cm(each, truth) for each in (estimates, plain))
+    errors = f"with it, poses are up to {worst:.1f} cm off, without it up to {usual:.1f} cm"
+    print(_indented("", f"{errors}; {told}"))
+    return estimates, told
+
+
+def what_happened(estimates: Sequence[PoseInterval]) -> str:
+    """Return in words which frames of a clip with a hand have no interval, and why.
+
+    ``estimates`` are those of the whole clip, in order.
+    """
+    lost = [number for number in HAND if not estimates[number].bounded]
+    if not lost:
+        return "all these frames have an interval, the hand is not noticed"
+    reasons = {reason: None for number in lost for reason in estimates[number].reasons}
+    text = f"no interval in {len(lost)} of {len(HAND)} frames ({', '.join(reasons)})"
+    back = next((n for n in range(HAND.stop, len(estimates)) if estimates[n].bounded), None)
+    if back is None:
+        return f"{text}, nor in any later one"
+    return f"{text}, intervals are back in frame {back}"
+
+
+def _worst_cm(estimates: Sequence[PoseInterval], truth: GroundTruth) -> float:
+    """Return the largest position error in the frames of the hand, in centimetres."""
+    errors = [0.0]
+    for number in HAND:
+        pose, true = estimates[number].pose, truth.pose_of(estimates[number])
+        if pose is not None and true is not None:
+            errors.append(100 * float(np.linalg.norm(pose.t_m - true[:3])))
+    return max(errors)
+
+
+def _turns(estimates: Sequence[PoseInterval]) -> list[int]:
+    """Return the frames on both sides of the first loss of the interval and of its return."""
+    bounded = [estimate.bounded for estimate in estimates]
+    changes = [n for n in range(HAND.start, len(bounded)) if bounded[n] != bounded[n - 1]]
+    ends = changes[:1] + [n for n in changes if n >= HAND.stop][:1]
+    return sorted({number for end in ends for number in (end - 1, end)})
+
+
+def _indented(name: str, text: str) -> str:
+    """Return a line of the summary, wrapped."""
+    return fill(text, 80, initial_indent=f"{name:<12}", subsequent_indent=" " * 12)
 
 
 def expected_coverage(digest: str) -> str | None:

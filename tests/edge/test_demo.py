@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -13,12 +14,16 @@ import numpy as np
 import pytest
 
 from cvo_edge import geometry
+from cvo_edge.bundle.format import DEGRADATION_OUTPUT, NOVELTY_OUTPUT, AlarmSpec
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.errors import SinkError, UsageError
-from cvo_edge.estimate import PoseInterval, Status
-from cvo_edge.output.picture import HEIGHT, WIDTH, draw_run, write_png
+from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.input.sources import open_source
+from cvo_edge.odometer import Odometer
+from cvo_edge.output.picture import HEIGHT, WIDTH, Span, draw_run, write_png
 from cvo_edge.pose import Chart, Pose
-from cvo_edge.programs.demo import EXPECTED, PACKAGED, demo, expected_coverage
+from cvo_edge.programs.demo import EXPECTED, PACKAGED, demo, expected_coverage, what_happened
+from cvo_edge.programs.hand import HAND, covered, with_hand
 from cvo_edge.sets import ConformalSet, unbounded_set
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,13 +47,15 @@ def test_it_needs_nothing_but_the_package_and_leaves_nothing_but_a_picture(tmp_p
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
     assert lines[0].startswith("synthetic-room-scr-int8: digests match")
-    shown = [line.split()[0] for line in lines if line.startswith(("frame-", "..."))]
+    shown = [line.split()[0] for line in lines if line.startswith(("frame-", "..."))][:5]
     assert shown == [*(f"frame-{number:06}" for number in range(4)), "..."]
     (coverage,) = [line for line in lines if line.startswith("coverage")]
     assert coverage.endswith("of 50 frames")
-    shown = " ".join(done.stdout.partition("expected")[2].split())
+    plain, _, hand = done.stdout.partition("\nhand")
+    assert hand
+    shown = " ".join(plain.partition("expected")[2].split())
     expected = expected_coverage(read_calibration(PACKAGED / "bundle").digest)
-    assert shown == f"{expected} {lines[-1]}"
+    assert shown == expected
     assert [file.name for file in tmp_path.iterdir()] == [lines[-1]]
     assert cv2.imread(str(tmp_path / lines[-1])).shape == (HEIGHT, WIDTH, 3)
 
@@ -118,8 +125,111 @@ def test_the_sentence_has_the_figures_of_its_bundle_and_there_is_none_for_others
     assert expected_coverage("0" * 64) is None
 
 
+# ----------------------------------------------------------------------------------- the hand
+
+
+@cache
+def clip():
+    return [frame.image for frame in open_source(str(PACKAGED / "clip"))]
+
+
+def test_a_hand_covers_some_frames_of_the_clip_and_changes_no_other():
+    images = clip()
+    shown = [frame.image for frame in covered(open_source(str(PACKAGED / "clip")))]
+    changed = [(a != b).any(axis=2).mean() for a, b in zip(images, shown, strict=True)]
+    assert [number for number, share in enumerate(changed) if share] == list(HAND)
+    # It comes, stays and goes again; it hides a part, and comes from below.
+    assert 0 < changed[HAND.start] < changed[HAND.start + 1] < changed[HAND.start + 2]
+    assert 0.2 < max(changed) < 0.5
+    assert changed[HAND.stop - 1] == pytest.approx(changed[HAND.start], abs=0.01)
+    top = images[HAND.start].shape[0] // 2
+    assert (images[HAND.start][:top] == shown[HAND.start][:top]).all()
+
+
+@pytest.mark.parametrize("shape", [(240, 320, 3), (97, 50, 3)])
+def test_a_hand_is_the_same_for_the_same_arguments(shape):
+    image = np.full(shape, 40, np.uint8)
+    drawn = with_hand(image, 1.0, 7)
+    assert (image == 40).all()
+    assert (drawn.shape, drawn.dtype) == (shape, np.uint8)
+    assert np.array_equal(drawn, with_hand(image, 1.0, 7))
+    assert not np.array_equal(drawn, with_hand(image, 1.0, 8))
+    assert np.array_equal(with_hand(image, 0.0, 7), image)
+
+
+class KnowsItsClip:
+    """Replaces ``Odometer.load``: an odometer with an alarm that knows the clip's own images."""
+
+    def __init__(self, kind, load=Odometer.load):
+        self.kind, self.load = kind, load
+
+    def __call__(self, *arguments, **options):
+        odometer = self.load(*arguments, **options)
+        # Statistics are 0 for the clip's own images and 10 for any other; the limit is 2.
+        alarm = AlarmSpec(self.kind, (0.0,) * 5, (1.0,) * 5, (2.0,) * 5, 20)
+        odometer.calibration = msgspec.structs.replace(odometer.calibration, alarm=alarm)
+        known = {image.tobytes() for image in clip()}
+        observe = odometer.observe
+
+        def observed(image, seq):
+            found = observe(image, seq)
+            value = 0.0 if image.tobytes() in known else 10.0
+            outputs = {
+                NOVELTY_OUTPUT: np.full((1, 4), value),
+                DEGRADATION_OUTPUT: np.zeros((1, 1)),
+            }
+            return replace(found, outputs={**found.outputs, **outputs})
+
+        odometer.observe = observed
+        return odometer
+
+
+@pytest.mark.whole_clip
+def test_an_alarm_notices_the_hand_and_the_intervals_come_back(
+    bundle_dir, capfd, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(Odometer, "load", KnowsItsClip("recordings"))
+    demo(bundle_dir, tmp_path / "hand.png")
+    plain, _, hand = capfd.readouterr().out.partition("\nhand ")
+    # The part without a hand stays as it is.
+    assert "50 ok, 0 degraded" in plain
+    assert "drift       clear: no alarm" in plain
+    rows = [line.split()[:2] for line in hand.splitlines() if line.startswith("frame-")]
+    assert [status for _, status in rows] == ["ok", "degraded", "degraded", "ok"]
+    lost, back = int(rows[1][0][-6:]), int(rows[3][0][-6:])
+    assert lost in HAND
+    assert HAND.stop < back < 40
+    assert f"(image_unfamiliar), intervals are back in frame {back}" in " ".join(hand.split())
+    picture = cv2.imread(str(tmp_path / "hand.png"))
+    assert count(picture, MARKED) > 1000
+    assert count(picture, (225, 225, 225)) > 1000
+
+
+def test_what_happened_is_told_whatever_it_is():
+    estimates, _ = flight(50)
+
+    def told(lost):
+        changed = list(estimates)
+        for number in lost:
+            changed[number] = replace(
+                changed[number],
+                conformal_set=unbounded_set(),
+                status=Status.DEGRADED,
+                reasons=(Reason.IMAGE_UNFAMILIAR,),
+            )
+        return what_happened(changed)
+
+    assert told([]) == "all these frames have an interval, the hand is not noticed"
+    assert told(range(HAND.stop, 50)) == told([])
+    some = "no interval in 2 of 12 frames (image_unfamiliar)"
+    assert told([14, 15]) == f"{some}, intervals are back in frame 24"
+    assert told([14, 15, *range(24, 31), 40]) == f"{some}, intervals are back in frame 31"
+    assert told([14, 15, *range(24, 50)]) == f"{some}, nor in any later one"
+
+
 # --------------------------------------------------------------------------------- the picture
 
+MARKED = (167, 121, 204)
 MISSED = (0, 94, 213)
 ABOUT_THE_PREDICTION = Chart("tangent_predicted")
 
@@ -203,6 +313,17 @@ def test_a_frame_without_interval_or_truth_is_grey_and_a_run_of_them_no_picture(
         draw_run(estimates, [None] * 12, "title")
     with pytest.raises(UsageError, match="found 11 for 12 estimates"):
         draw_run(estimates, truths[1:], "title")
+
+
+def test_a_span_is_marked_and_changes_nothing_else():
+    estimates, truths = flight()
+    plain = draw_run(estimates, truths, "title")
+    marked = draw_run(estimates, truths, "title", span=Span(3, 8, "hand"))
+    assert count(plain, MARKED) == 0
+    wider = draw_run(estimates, truths, "title", span=Span(3, 11, "hand"))
+    assert 0 < count(marked, MARKED) < count(wider, MARKED)
+    # Bars and a swatch in the legend, and a line below the path.
+    assert 0.97 < (plain == marked).all(axis=2).mean() < 1
 
 
 @pytest.mark.parametrize("frames", [1, 2, 2000])
