@@ -48,6 +48,14 @@ def test_every_reason_and_every_exit_code_is_explained() -> None:
     assert f"{128 + signal.SIGINT}, {128 + signal.SIGTERM}" in rows
 
 
+def test_every_reason_that_takes_the_interval_has_its_remedy() -> None:
+    table = (ROOT / "docs" / "faults.md").read_text("utf-8")
+    degraded = set(re.findall(r"(?m)^\| `([a-z0-9_]+)` \| `degraded`", table))
+    page = (ROOT / "docs" / "degraded.md").read_text("utf-8")
+    headings = "".join(re.findall(r"(?m)^### .*$", page))
+    assert set(re.findall(r"`([a-z0-9_]+)`", headings)) == degraded
+
+
 def test_every_kind_of_damage_was_tried_without_a_finding() -> None:
     for kind, (what, count, _) in KINDS.items():
         found = json.loads((FAULTS / f"{kind}.json").read_text("utf-8"))
