@@ -47,14 +47,20 @@ _FRAME: Colour = (150, 150, 150)
 _UNITS = (100.0,) * 3 + (math.degrees(1.0),) * 3
 _OUTLINED = 5
 _PADDING = 0.08
+_INSET = 140
 
 
 class Span(NamedTuple):
-    """Frames to mark, by their positions in the run: the first, the last, and what they show."""
+    """Frames to mark, by their positions in the run: the first, the last, and what they show.
+
+    ``image`` is one of them (height, width, 3), BGR, and ``number`` its position.
+    """
 
     first: int
     last: int
     shows: str
+    number: int
+    image: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +110,7 @@ def draw_run(
     title, lines
         A heading and up to three lines below it; printable ASCII only, as OpenCV 4 requires.
     span
-        Frames to mark with a bar.
+        Frames to mark with a bar; its image is shown where it hides least of the path.
 
     Returns
     -------
@@ -267,6 +273,8 @@ def _path_from_above(
     draw_text(canvas, "Path in the x-y plane of the world", (area[0], 105), 7.5, bold=True)
     note = f"outlined: one box in {every}"
     draw_text(canvas, note, (area[2], 120), 5.5, align=1.0)
+    if span:
+        _inset(canvas, area, span)
     draw_text(canvas, "x (m)", (0.5 * (area[0] + area[2]), 748), 6, align=0.5)
     draw_text(canvas, "y (m)", (area[0], 120), 6, align=1.0)
 
@@ -334,6 +342,28 @@ def _bar(
     panel = _Panel(canvas, area, (-0.5, count - 0.5), (0.0, 1.0))
     corners = panel.box((span.first - 0.5, span.last + 0.5), (0.0, 0.05))
     cv2.fillPoly(canvas, [corners], _MARKED, cv2.LINE_AA, BITS)
+
+
+def _inset(canvas: NDArray[np.uint8], area: tuple[int, int, int, int], span: Span) -> None:
+    """Show the image of a span in the emptiest corner of a panel."""
+    left, top, right, bottom = area
+    width = _INSET
+    height = round(width * span.image.shape[0] / span.image.shape[1])
+    places = [
+        (x, y) for x in (right - width - 8, left + 8) for y in (top + 8, bottom - height - 24)
+    ]
+
+    def part(place: tuple[int, int], below: int = 0) -> NDArray[np.uint8]:
+        x, y = (SCALE * value for value in place)
+        return canvas[y : y + SCALE * (height + below), x : x + SCALE * width]
+
+    # Any colour but white and that of the grid.
+    x, y = min(places, key=lambda place: int((part(place, 18).min(axis=2) < min(_GRID)).sum()))
+    size = (SCALE * width, SCALE * height)
+    part((x, y))[:] = cv2.resize(span.image, size, interpolation=cv2.INTER_AREA)
+    corners = fixed([(x, y), (x + width, y), (x + width, y + height), (x, y + height), (x, y)])
+    draw_line(canvas, corners, _MARKED, 2.0)
+    draw_text(canvas, f"frame {span.number}", (x + width / 2, y + height + 14), 5.5, align=0.5)
 
 
 def _legend(canvas: NDArray[np.uint8], *, greyed: bool, span: Span | None) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from cvo_edge.errors import UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.ground_truth import GroundTruth, open_ground_truth
+from cvo_edge.input.frame import Frame
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
 from cvo_edge.output.picture import Span, draw_run, write_png
@@ -79,10 +80,12 @@ def demo(bundle: Path, picture: Path) -> None:
         if odometer.calibration.alarm is None:
             print(_indented("hand", "not shown: it takes an alarm, and this bundle has none"))
         else:
-            estimates, told = _with_hand(odometer, estimates, truth, table)
+            frames = list(covered(open_source(str(CLIP))))
+            estimates, told = _with_hand(odometer, frames, estimates, truth, table)
             notes = [f"Without the hand: {note}" for note in notes[:1] if note] + notes[1:]
             notes = [*filter(None, notes), f"With {_HAND}: {told}."]
-            span = Span(HAND.start, HAND.stop - 1, "hand")
+            middle = HAND[len(HAND) // 2]
+            span = Span(HAND.start, HAND.stop - 1, "hand", middle, np.asarray(frames[middle].image))
     drawn = draw_run(
         estimates,
         [truth.pose_of(estimate) for estimate in estimates],
@@ -95,14 +98,18 @@ def demo(bundle: Path, picture: Path) -> None:
 
 
 def _with_hand(
-    odometer: Odometer, plain: Sequence[PoseInterval], truth: GroundTruth, table: Sink
+    odometer: Odometer,
+    frames: Sequence[Frame],
+    plain: Sequence[PoseInterval],
+    truth: GroundTruth,
+    table: Sink,
 ) -> tuple[list[PoseInterval], str]:
     """Run the clip with a hand, and print what happens; ``plain`` are the estimates without it.
 
     Returns the estimates, and what happened in words.
     """
     print(_indented("hand", f"the clip again, with {_HAND}:"), flush=True)
-    estimates = list(odometer.stream(covered(open_source(str(CLIP)))))
+    estimates = list(odometer.stream(frames))
     for number in _turns(estimates):
         table.write(estimates[number])
     told = what_happened(estimates)

@@ -229,7 +229,7 @@ def test_what_happened_is_told_whatever_it_is():
 
 # --------------------------------------------------------------------------------- the picture
 
-MARKED = (167, 121, 204)
+MARKED, ESTIMATE = (167, 121, 204), (178, 114, 0)
 MISSED = (0, 94, 213)
 ABOUT_THE_PREDICTION = Chart("tangent_predicted")
 
@@ -315,15 +315,23 @@ def test_a_frame_without_interval_or_truth_is_grey_and_a_run_of_them_no_picture(
         draw_run(estimates, truths[1:], "title")
 
 
-def test_a_span_is_marked_and_changes_nothing_else():
+def test_a_span_is_marked_with_an_image_beside_the_path():
     estimates, truths = flight()
-    plain = draw_run(estimates, truths, "title")
-    marked = draw_run(estimates, truths, "title", span=Span(3, 8, "hand"))
+    image = np.full((30, 40, 3), (8, 248, 8), np.uint8)
+
+    def drawn(span):
+        return draw_run(estimates, truths, "title", span=span)
+
+    plain, short, wide = map(
+        drawn, (None, Span(3, 8, "hand", 5, image), Span(3, 11, "x", 5, image))
+    )
     assert count(plain, MARKED) == 0
-    wider = draw_run(estimates, truths, "title", span=Span(3, 11, "hand"))
-    assert 0 < count(marked, MARKED) < count(wider, MARKED)
-    # Bars and a swatch in the legend, and a line below the path.
-    assert 0.97 < (plain == marked).all(axis=2).mean() < 1
+    assert 0 < count(short, MARKED) < count(wide, MARKED)
+    # The image is in the left panel and hides no estimate there.
+    shown = (np.abs(short.astype(int) - (8, 248, 8)) <= 8).all(axis=2)
+    assert 0.9 * 140 * 105 < shown.sum() <= 140 * 105
+    assert shown[128:715, 75:505].sum() == shown.sum()
+    assert (np.abs(plain[shown].astype(int) - ESTIMATE) > 8).any(axis=1).all()
 
 
 @pytest.mark.parametrize("frames", [1, 2, 2000])
