@@ -20,6 +20,7 @@ from pathlib import Path
 import accuracy_tables
 import comparison_tables
 import localiser_tables
+import promised_table
 import speed_tables
 import study_tables
 import vigilance_tables
@@ -48,6 +49,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **localiser_tables.TABLES,
     **speed_tables.TABLES,
     **vigilance_tables.TABLES,
+    **promised_table.TABLES,
     "faults": faults,
     "goals": goals_table,
     "results": results_index,

@@ -55,8 +55,10 @@ def digits(value: float | None, count: int = 2) -> str:
     return "-" if value is None else f"{value:.{count}f}".removeprefix("0")
 
 
-def _title(bundle: str, states: dict[str, list[Report]]) -> str:
-    situation = next(iter(states.values()))[0].get("situation")
+def title(bundle: str, states: dict[str, list[Report]]) -> str:
+    """Return a bundle's name and its situation, if any of its reports states it."""
+    situations = (each.get("situation") for seeds in states.values() for each in seeds)
+    situation = next((each for each in situations if each), None)
     return f"{bundle} ({situation})" if situation else bundle
 
 
@@ -79,7 +81,7 @@ def wrong_frames() -> str:
                 continue
             for group, label in (("all", "all kinds"), ("left_out", "left out of any fit")):
                 summaries = [report["summary"][group] for report in states[state]]
-                rows.append([_title(bundle, states), state, label, *_summary(summaries)])
+                rows.append([title(bundle, states), state, label, *_summary(summaries)])
     if not found:
         return NOTHING
     return table(["bundle", "", "kinds", "number", "median", "over .10", "over .15", "worst"], rows)
@@ -91,7 +93,7 @@ def _summary(summaries: list[Report]) -> list[str]:
     return [f"{summaries[0]['kinds']}", shares[0], *over, shares[1]]
 
 
-def _wrong(seeds: list[Report], family: str | None = None) -> dict[str, float]:
+def wrong_shares(seeds: list[Report], family: str | None = None) -> dict[str, float]:
     """Return the share that is finite and wrong by kind, the median over seeds."""
     kinds = {
         name: figures
@@ -116,7 +118,7 @@ def families() -> str:
     for name in names:
         row = [name]
         for _, seeds in columns:
-            shares = list(_wrong(seeds, name).values())
+            shares = list(wrong_shares(seeds, name).values())
             over = sum(share > OVER for share in shares)
             row.append(f"{digits(median(shares))}; {over} of {len(shares)}")
         rows.append(row)
@@ -130,7 +132,7 @@ def worst() -> str:
         return NOTHING
     rows = []
     for head, seeds in columns:
-        shares = sorted(_wrong(seeds).items(), key=lambda item: -item[1])
+        shares = sorted(wrong_shares(seeds).items(), key=lambda item: -item[1])
         full = sum(share == shares[0][1] for _, share in shares)
         if full > WORST:
             rows.append([head, f"{full} kinds {digits(shares[0][1])}"])
@@ -202,7 +204,7 @@ def noise() -> str:
         for state in STATES:
             for name in states[state][0]["noises"] if state in states else ():
                 entries = [report["noises"][name] for report in states[state]]
-                rows.append([_title(bundle, states), state, name, *_noise(entries)])
+                rows.append([title(bundle, states), state, name, *_noise(entries)])
     if not found:
         return NOTHING
     return table(
@@ -238,7 +240,7 @@ def false_alarms() -> str:
                 reasons = (f"{reason} {n:,}" for reason, n in report["reasons"].items())
                 rows.append(
                     [
-                        _title(bundle, states),
+                        title(bundle, states),
                         state,
                         f"{report['doubted']:,} of {report['frames']:,}",
                         f"{report['episodes']:,}",

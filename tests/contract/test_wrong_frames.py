@@ -10,6 +10,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 
+import promised_table
 import vigilance_tables
 from alarms import false_alarms
 from wrong_frames import shares, streams_of, summary
@@ -81,3 +82,43 @@ def test_episodes_are_runs_and_end_with_a_stream():
 def test_tables_say_where_nothing_was_measured(monkeypatch):
     monkeypatch.setattr(vigilance_tables, "result_files", lambda _: [])
     assert {make() for make in vigilance_tables.TABLES.values()} == {vigilance_tables.NOTHING}
+
+
+def _frames(wrong, finite):
+    kinds = {"torn": ("torn", wrong), "two": ("torn", 0.0), "still": ("frozen", 0.9)}
+    reasons = {"frame_repeated": 0.1, "image_degraded": 0.3}
+    return {
+        "situation": "known frames",
+        "wrong": {
+            name: {"family": family, "changed": True, "wrong": share}
+            for name, (family, share) in kinds.items()
+        },
+        "hinted": {},
+        "harmless": {
+            "clean": {"finite": 1.0, "reasons": {}},
+            "darker": {"finite": finite, "reasons": reasons},
+        },
+    }
+
+
+def test_the_promises_name_the_worst_of_what_was_measured_with_an_alarm(monkeypatch):
+    found = {
+        "frames": {
+            "a": {"before": [_frames(1.0, 1.0)], "after": [_frames(0.2, 0.6)]},
+            "b": {"before": [_frames(1.0, 1.0)]},
+        },
+        "rooms": {"c": {"after": [{"rooms": {"x": {"finite": 0.0}, "y": {"finite": 0.03}}}]}},
+    }
+    monkeypatch.setattr(promised_table, "reports", lambda program: found.get(program, {}))
+    head, _, *rows = promised_table.promised().splitlines()
+    assert head == "| situation | what should happen | proven | a (known frames) | c |"
+    cells = {row.split(" | ")[0].removeprefix("| "): row.split(" | ")[3:] for row in rows}
+    assert cells == {
+        "right frames: false alarms": ["none in .00 (clean), by the alarm .00", "- |"],
+        "right frames, harmlessly changed": ["none in .40 (darker), by the alarm .30", "- |"],
+        "another room": ["-", "interval: at most .030 (y) |"],
+        "wrong frames: frozen": ["median .90; wrong at most .90 (still)", "- |"],
+        "wrong frames: torn": ["median .10; wrong at most .20 (torn)", "- |"],
+    }
+    del found["frames"]["a"]["after"], found["rooms"]
+    assert promised_table.promised() == vigilance_tables.NOTHING

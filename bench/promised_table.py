@@ -1,0 +1,189 @@
+"""The table of ``docs/vigilance.md`` that sums up what is promised with an alarm.
+
+One column for each bundle of which anything was measured with an alarm, one row for each situation
+of which anything was measured. Failures are named: each row gives the worst case as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from markdown_table import table
+from vigilance_tables import NOTHING, Report, digits, median, reports, title, wrong_shares
+
+STATE = "after"
+# The reasons that the alarm gives; others are those of checks, e.g. of repeated pictures.
+ALARM = ("image_unfamiliar", "image_degraded")
+PROGRAMS = ("frames", "rooms", "noise", "alarms")
+NO_PROOF = "-"
+
+# Program -> reports of all seeds of one bundle; a program that was not run has none.
+Measured = dict[str, list[Report]]
+
+
+class Situation(NamedTuple):
+    """A row: what is seen, what should happen, what is proven, and the figures if there are any."""
+
+    name: str
+    happens: str
+    proven: str
+    figures: Callable[[Measured], str | None]
+
+
+def covered(measured: Measured) -> str | None:
+    """Return the joint coverage of clean frames that have an interval."""
+    found = [each["noises"]["none"]["with_alarm"] for each in measured["noise"]]
+    share = median(each["joint_coverage"] for each in found)
+    return None if share is None else f"covered {digits(share, 3)} (all six, 0.9)"
+
+
+def without_interval(measured: Measured) -> str | None:
+    """Return how many right frames have no interval, in long streams and in single ones."""
+    parts = [
+        f"none in {each['doubted']:,} of {each['frames']:,} frames, "
+        f"{each['streams_with_doubts']} of {each['streams']} streams"
+        for each in measured["alarms"]
+    ]
+    parts += _share_without(measured, lambda name: name == "clean")
+    return "; ".join(parts) or None
+
+
+def changed(measured: Measured) -> str | None:
+    """Return the largest share without an interval after a harmless change."""
+    return "; ".join(_share_without(measured, lambda name: name != "clean")) or None
+
+
+def _share_without(measured: Measured, wanted: Callable[[str], bool]) -> list[str]:
+    reports = measured["frames"]
+    if not reports:
+        return []
+    lost = {
+        name: (
+            median(1.0 - each["harmless"][name]["finite"] for each in reports) or 0.0,
+            median(_alarmed(each["harmless"][name]) for each in reports),
+        )
+        for name in reports[0]["harmless"]
+        if wanted(name)
+    }
+    name, (share, alarmed) = max(lost.items(), key=lambda item: item[1][0])
+    return [f"none in {digits(share)} ({name}), by the alarm {digits(alarmed)}"]
+
+
+def _alarmed(figures: Report) -> float:
+    return sum(share for reason, share in figures["reasons"].items() if reason in ALARM)
+
+
+def noise(measured: Measured) -> str | None:
+    """Return how many noisy frames have an interval, and the largest share that it misses."""
+    reports = measured["noise"]
+    if not reports:
+        return None
+    names = [name for name in reports[0]["noises"] if name != "none"]
+    given = {
+        key: {
+            name: median(each["noises"][name]["with_alarm"][key] for each in reports) or 0.0
+            for name in names
+        }
+        for key in ("finite", "finite_and_wrong")
+    }
+    return f"interval {_range(given['finite'].values())}; {_worst(given['finite_and_wrong'])}"
+
+
+def rooms(measured: Measured) -> str | None:
+    """Return how many frames of other rooms have an interval."""
+    reports = measured["rooms"]
+    names = dict.fromkeys(name for each in reports for name in each["rooms"])
+    shares = {
+        name: median(each["rooms"][name]["finite"] for each in reports if name in each["rooms"])
+        or 0.0
+        for name in names
+    }
+    if not shares:
+        return None
+    name, share = max(shares.items(), key=lambda item: item[1])
+    return f"interval: at most {digits(share, 3)} ({name})"
+
+
+def family(name: str) -> Callable[[Measured], str | None]:
+    """Return what gives the median and the worst kind of one family of wrong frames."""
+
+    def figures(measured: Measured) -> str | None:
+        if not measured["frames"]:
+            return None
+        shares = wrong_shares(measured["frames"], name)
+        return f"median {digits(median(shares.values()))}; {_worst(shares)}" if shares else None
+
+    return figures
+
+
+def hinted(measured: Measured) -> str | None:
+    """Return the worst frozen kind with the hint that the camera moves."""
+    reports = measured["frames"]
+    names = reports[0]["hinted"] if reports else ()
+    shares = {
+        name.removesuffix(", with the hint"): median(
+            each["hinted"][name]["wrong"] for each in reports
+        )
+        or 0.0
+        for name in names
+    }
+    return _worst(shares) if shares else None
+
+
+def _range(shares: Iterable[float]) -> str:
+    values = list(shares)
+    return f"{digits(min(values))} to {digits(max(values))}"
+
+
+def _worst(shares: dict[str, float]) -> str:
+    name, share = max(shares.items(), key=lambda item: item[1])
+    return f"wrong at most {digits(share)}" + (f" ({name})" if share else "")
+
+
+DOUBT = "no interval, or one that holds"
+SITUATIONS = (
+    Situation("right frames", "an interval that holds", "[the guarantee](guarantee.md)", covered),
+    Situation(
+        "right frames: false alarms",
+        "an interval",
+        "[at most](guarantee.md#the-alarm) 1 % of known frames, 5 / (G + 1) of new recordings",
+        without_interval,
+    ),
+    Situation("right frames, harmlessly changed", "an interval", NO_PROOF, changed),
+    Situation("noise of the study", DOUBT, NO_PROOF, noise),
+    Situation("another room", "no interval", NO_PROOF, rooms),
+    Situation(
+        "wrong frames: frozen",
+        "no interval; a still with fresh noise passes as a camera at rest",
+        NO_PROOF,
+        family("frozen"),
+    ),
+    Situation("frozen, and the hint that the camera moves", "no interval", NO_PROOF, hinted),
+    *(
+        Situation(f"wrong frames: {name}", DOUBT, NO_PROOF, family(name))
+        for name in ("geometry", "torn", "colour and format", "sensor", "optics", "no picture")
+    ),
+)
+
+
+def promised() -> str:
+    """Return what should happen in each situation and how often it did, for each bundle."""
+    bundles: dict[str, Measured] = {}
+    for program in PROGRAMS:
+        for bundle, states in reports(program).items():
+            if states.get(STATE):
+                empty: Measured = {each: [] for each in PROGRAMS}
+                bundles.setdefault(bundle, empty)[program] = states[STATE]
+    if not bundles:
+        return NOTHING
+    heads = [title(bundle, measured) for bundle, measured in bundles.items()]
+    rows = []
+    for each in SITUATIONS:
+        cells = [each.figures(measured) for measured in bundles.values()]
+        if any(cells):
+            rows.append([each.name, each.happens, each.proven, *(cell or "-" for cell in cells)])
+    return table(["situation", "what should happen", "proven", *heads], rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {"vigilance-promised": promised}
