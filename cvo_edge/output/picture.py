@@ -133,9 +133,9 @@ def draw_run(
             f"picture: none of the {len(estimates)} frames has finite bounds and a true pose"
         )
     canvas = np.full((SCALE * HEIGHT, SCALE * WIDTH, 3), 255, np.uint8)
-    draw_text(canvas, title, (24, 30), 10.5, bold=True, colour=_TRUTH)
+    draw_text(canvas, title, (24, 28), 10.5, bold=True, colour=_TRUTH)
     for number, line in enumerate(lines):
-        draw_text(canvas, line, (24, 50 + 18 * number), 6.5)
+        draw_text(canvas, line, (24, 47 + 17 * number), 6.5)
     _path_from_above(canvas, frames, truths, span)
     names = estimates[0].chart.dof
     for column, heading in enumerate(("Position minus truth (cm)", "Rotation minus truth (deg)")):

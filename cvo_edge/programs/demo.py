@@ -79,7 +79,7 @@ def demo(bundle: Path, picture: Path) -> None:
         span = None
         if odometer.calibration.alarm is None:
             print(_indented("hand", "not shown: it takes an alarm, and this bundle has none"))
-        else:
+        elif summary.bounded:  # if not, the clip is no scene of this bundle
             frames = list(covered(open_source(str(CLIP))))
             estimates, told = _with_hand(odometer, frames, estimates, truth, table)
             notes = [f"Without the hand: {note}" for note in notes[:1] if note] + notes[1:]
