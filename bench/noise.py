@@ -25,7 +25,7 @@ from provenance import write_result
 from cvo_edge.estimate import PoseInterval, Reason
 from cvo_edge.odometer import Odometer
 from cvo_edge.sets import ConformalSet
-from cvo_export.bundles.thresholds import workspace
+from cvo_export.bundles.choice import workspace
 from cvo_export.data.noise import KINDS, Noise, noisy
 from cvo_export.datasets import PoseDataset
 

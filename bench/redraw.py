@@ -25,8 +25,9 @@ from cvo_edge.errors import UsageError
 from cvo_edge.heads import Head
 from cvo_edge.odometer import Odometer
 from cvo_edge.vocabulary import Rule
+from cvo_export.bundles.observed import Observed, Scored, observe
 from cvo_export.bundles.rule import DEFAULT_CAP
-from cvo_export.bundles.thresholds import Observed, Scored, observe, thresholds
+from cvo_export.bundles.thresholds import thresholds
 from cvo_export.data.splits import same_split
 from cvo_export.datasets import open_dataset
 

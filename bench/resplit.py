@@ -20,7 +20,7 @@ from provenance import write_result
 from cvo_edge.conformal import conformal_quantile, conformal_rank
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.odometer import Odometer
-from cvo_export.bundles.thresholds import observe
+from cvo_export.bundles.observed import observe
 from cvo_export.data.splits import same_split
 from cvo_export.datasets import open_dataset
 

@@ -137,6 +137,28 @@ class ConformalSet:
             ellipsoids=ellipsoids,
         )
 
+    def stretched(self, point: Array, factor: float) -> ConformalSet:
+        """Return {point + factor (y - point) : y in the set}, for a point (6,) and a factor > 0."""
+        bands, ellipsoids = self.bands, self.ellipsoids
+        if bands is not None:
+            bands = tuple(
+                tuple((at + factor * (low - at), at + factor * (high - at)) for low, high in row)
+                for row, at in zip(bands, point.tolist(), strict=True)
+            )
+        if ellipsoids is not None:
+            ellipsoids = replace(
+                ellipsoids,
+                centres=point + factor * (ellipsoids.centres - point),
+                scale=factor * ellipsoids.scale,
+            )
+        return replace(
+            self,
+            lower=point + factor * (self.lower - point),
+            upper=point + factor * (self.upper - point),
+            bands=bands,
+            ellipsoids=ellipsoids,
+        )
+
     def width(self) -> Array:
         """Return the width per DoF, (6,): the total length of the bands, not of their hull."""
         if self.bands is None:

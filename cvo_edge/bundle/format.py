@@ -38,6 +38,8 @@ Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$(?!\n)")]
 SELFTEST_TOLERANCE: dict[Precision, float] = {"fp32": 1e-3, "int8": 1e-2}
 # Far above every plausible value, whether metres, radians, probabilities or scales.
 MAX_NUMBER = 1e9
+# Of the logarithm of a factor between the sets of two frames: up to 150 times as wide.
+MOST_DIFFICULTY = 5.0
 Number = Annotated[float, Meta(gt=-MAX_NUMBER, lt=MAX_NUMBER)]
 Positive = Annotated[float, Meta(gt=0, lt=MAX_NUMBER)]
 Six = tuple[Number, Number, Number, Number, Number, Number]
@@ -211,6 +213,18 @@ class AlarmSpec(_Strict, frozen=True, omit_defaults=True):
     recordings: tuple[Number, ...] | None = None
 
 
+class DifficultySpec(_Strict, frozen=True):
+    """How the novelty of a frame scales its sets, see ``cvo_edge.heads.difficulty``.
+
+    log u = bias + weights . log(novelty), kept between ``lowest`` and ``highest``.
+    """
+
+    weights: tuple[Number, Number, Number, Number]
+    bias: Number
+    lowest: Annotated[float, Meta(ge=-MOST_DIFFICULTY, le=0)]
+    highest: Annotated[float, Meta(ge=0, le=MOST_DIFFICULTY)]
+
+
 class SelfTest(_Strict, frozen=True):
     """A synthetic image from an integer recipe, and the outputs expected for it."""
 
@@ -255,6 +269,7 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
     ``camera``: intrinsics of the calibration images' camera; null if the data set does not state
     them. ``images``: their size and colour; null in bundles of earlier releases. ``alarm``: when a
     stream's images are no longer like those of the calibration; null if the graph does not tell.
+    ``difficulty``: what scales the sets of the thresholds from frame to frame; null for nothing.
     """
 
     schema_version: Literal[1]
@@ -272,6 +287,7 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
     camera: Camera | None = None
     images: ImageSpec | None = None
     alarm: AlarmSpec | None = None
+    difficulty: DifficultySpec | None = None
 
     def threshold(self, confidence: float, scope: Scope) -> Threshold | None:
         """Return the stored threshold for this confidence and scope, or None.

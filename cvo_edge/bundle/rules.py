@@ -53,7 +53,7 @@ def check_rules(calibration: Calibration) -> None:
     _check_crossed(calibration)
     _check_model(calibration)
     _check_images(calibration)
-    _check_alarm(calibration)
+    _check_statistics(calibration)
 
 
 def _check_crossed(calibration: Calibration) -> None:
@@ -159,16 +159,17 @@ def _check_images(calibration: Calibration) -> None:
         )
 
 
-def _check_alarm(calibration: Calibration) -> None:
-    """Check that the model tells of what the alarm limits, and how many recordings there were."""
+def _check_statistics(calibration: Calibration) -> None:
+    """Check that the model tells what is needed, and how many recordings there were."""
+    tells = {spec.name for spec in calibration.model.outputs} >= FAMILIARITY.keys()
+    for key, found in (("alarm", "limits"), ("difficulty", "weights")):
+        if getattr(calibration, key) is not None and not tells:
+            raise CalibrationFileError(
+                f"{key}: expected null for a model without outputs novelty and degradation, found "
+                f"{found}"
+            )
     alarm = calibration.alarm
-    if alarm is None:
-        return
-    if not {spec.name for spec in calibration.model.outputs} >= FAMILIARITY.keys():
-        raise CalibrationFileError(
-            "alarm: expected null for a model without outputs novelty and degradation, found limits"
-        )
-    if alarm.recordings is None:
+    if alarm is None or alarm.recordings is None:
         return
     if alarm.kind != "recordings" or len(alarm.recordings) != alarm.n:
         raise CalibrationFileError(

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from copy import copy
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration, Threshold
+from cvo_edge.bundle.format import NOVELTY_OUTPUT, Calibration, DifficultySpec, Threshold
 from cvo_edge.camera_check import CameraCheck
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.estimate import Reason
+from cvo_edge.heads.difficulty import Difficulty
 from cvo_edge.input.view import SeenCamera
 from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import Joint, Scope
@@ -70,6 +72,8 @@ class Head(ABC):
     ----------
     outputs
         Name and shape of every model output that the method reads; all are float32.
+    difficulty
+        What scales the sets from frame to frame, or None; see ``scaled``.
     """
 
     method: ClassVar[str]
@@ -87,6 +91,7 @@ class Head(ABC):
     infinite_score: ClassVar[str] = "too many calibration truths have an infinite score"
 
     outputs: Mapping[str, tuple[int, ...]]
+    difficulty: Difficulty | None = None
 
     def __init__(self, parameters: Any, score: str) -> None:  # noqa: ANN401 - the method's struct
         if score not in self.score_names:
@@ -172,9 +177,14 @@ class Head(ABC):
 
     def scored_outputs(self) -> Collection[str]:
         """Return the names of the outputs that ``scores`` reads; by default all."""
-        return self.outputs
+        return self.outputs if self.difficulty is None else (*self.outputs, NOVELTY_OUTPUT)
 
-    @abstractmethod
+    def scaled(self, difficulty: DifficultySpec | None) -> Self:
+        """Return the head whose sets are scaled by the difficulty of each frame; None for none."""
+        head = copy(self)
+        head.difficulty = None if difficulty is None else Difficulty(difficulty)
+        return head
+
     def scores(
         self,
         outputs: Mapping[str, NDArray[Any]],
@@ -184,14 +194,40 @@ class Head(ABC):
     ) -> Array:
         """Outputs stacked over n frames, point and truth (n, 6) -> scores (n, sides, 6).
 
-        With ``one_joint_score``, the scores depend on the scope.
+        With ``one_joint_score``, the scores depend on the scope. With a difficulty u, they are the
+        plain scores of point + (truth - point) / u.
         """
+        if self.difficulty is not None:
+            truth = point + (truth - point) / self.difficulty.factors(outputs)[:, np.newaxis]
+        return self.plain_scores(outputs, point, truth, scope)
 
-    @abstractmethod
     def conformal_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
-        """Return the set {y : score(y) <= q_hat} of one frame; point (6,)."""
+        """Return the set {y : score(y) <= q_hat} of one frame; point (6,).
+
+        With a difficulty u, this is the plain set, stretched by u about the point.
+        """
+        found = self.plain_set(outputs, point, threshold)
+        if self.difficulty is None:
+            return found
+        return found.stretched(point, float(self.difficulty.factors(outputs)[0]))
+
+    @abstractmethod
+    def plain_scores(
+        self,
+        outputs: Mapping[str, NDArray[Any]],
+        point: Array,
+        truth: Array,
+        scope: Scope = "marginal",
+    ) -> Array:
+        """As ``scores``, whatever the difficulty of the frames."""
+
+    @abstractmethod
+    def plain_set(
+        self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
+    ) -> ConformalSet:
+        """As ``conformal_set``, whatever the difficulty of the frame."""
 
     def tuned(
         self,

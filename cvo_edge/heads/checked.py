@@ -29,7 +29,9 @@ def checked_head(calibration: Calibration) -> Head:
         )
     kind = HEADS[calibration.method]
     source = calibration.calibration
-    head = kind(calibration.parameters(kind.parameters_type), source.score)
+    head = kind(calibration.parameters(kind.parameters_type), source.score).scaled(
+        calibration.difficulty
+    )
     head.check(calibration.thresholds, source.joint)
     check_tensors(calibration.model, head)
     if head.solves and calibration.pose.rotation != "tangent_predicted":
@@ -40,6 +42,11 @@ def checked_head(calibration: Calibration) -> Head:
     if head.solves and calibration.camera is None:
         raise CalibrationFileError(
             f"camera: expected intrinsics for method {head.method}, found null"
+        )
+    if head.solves and head.difficulty is not None:
+        raise CalibrationFileError(
+            f"difficulty: expected null for method {head.method}, whose solver tells the errors of "
+            "each frame, found weights"
         )
     if not head.one_joint_score:
         _check_joint(calibration.thresholds, head)

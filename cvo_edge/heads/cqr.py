@@ -141,7 +141,7 @@ class CqrHead(Head):
         """As ``Head``; additive scores, and those of a single side, may be negative."""
         return self.score == "additive" or self._sides != "symmetric"
 
-    def scores(
+    def plain_scores(
         self,
         outputs: Mapping[str, NDArray[Any]],
         point: Array,
@@ -152,7 +152,7 @@ class CqrHead(Head):
         sides = self._score.sides(*self._interval(outputs, point), point, truth)
         return sides.max(axis=1, keepdims=True) if self._sides == "symmetric" else sides
 
-    def conformal_set(
+    def plain_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Outputs and point (6,) of one frame -> its set, or the midpoint if the set is empty."""

@@ -104,7 +104,7 @@ class CspHead(Head):
         ranks = int(self._classes.max()) - self.parameters.free_ranks
         return 1.0 + self.parameters.penalty * max(0, ranks)
 
-    def scores(
+    def plain_scores(
         self,
         outputs: Mapping[str, NDArray[Any]],
         point: Array,
@@ -122,7 +122,7 @@ class CspHead(Head):
             of_truth[:, dof] = np.where(inside, found, np.inf)
         return of_truth[:, np.newaxis]
 
-    def conformal_set(
+    def plain_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Outputs of one frame -> its bands and their hull; ``point`` is not used."""

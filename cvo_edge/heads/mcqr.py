@@ -113,7 +113,7 @@ class McqrHead(Head):
         """As ``Head``; the marginal additive score may be negative."""
         return scope == "marginal" and self.score == "additive"
 
-    def scores(
+    def plain_scores(
         self,
         outputs: Mapping[str, NDArray[Any]],
         point: Array,
@@ -138,7 +138,7 @@ class McqrHead(Head):
         sides = self._score.sides(lower, upper, 0.5 * (lower + upper), truth)
         return np.asarray(sides.max(axis=1, keepdims=True))
 
-    def conformal_set(
+    def plain_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Outputs of one frame -> its region and hull, or six intervals; ``point`` is not used."""

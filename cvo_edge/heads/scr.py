@@ -299,7 +299,7 @@ class ScrHead(Head):
         """As ``Head``: the scale of the errors, without the cells."""
         return ("scale",)
 
-    def scores(
+    def plain_scores(
         self,
         outputs: Mapping[str, NDArray[Any]],
         point: Array,
@@ -314,7 +314,7 @@ class ScrHead(Head):
             return np.tile(distance[:, np.newaxis, np.newaxis], (1, 1, 6))
         return np.asarray(np.abs(error) / deviation)[:, np.newaxis]
 
-    def conformal_set(
+    def plain_set(
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Outputs and point (6,) of one frame -> six intervals, or an ellipsoid and its hull."""

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from textwrap import wrap
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from cvo_edge.bundle.format import Calibration, CalibrationSpec, ImageSpec, Position, SelfTest
+from cvo_edge.bundle.format import (
+    Calibration,
+    CalibrationSpec,
+    DifficultySpec,
+    ImageSpec,
+    Position,
+    SelfTest,
+)
 from cvo_edge.camera import Camera
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.errors import CalibrationFileError
@@ -29,7 +37,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
     pose, head = calibration.pose, checked_head(calibration)
     details = f", {head.description()}" if head.description() else ""
     tensors = ", ".join(f"{t.name} {list(t.shape)}" for t in (*model.inputs, *model.outputs))
-    dof = Chart(pose.rotation).dof
+    dof, scale = Chart(pose.rotation).dof, calibration.difficulty
     lines = [
         *_entry("name", calibration.name),
         *_entry("method", f"{calibration.method}, {source.score} score{details}"),
@@ -52,6 +60,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
         *([] if calibration.images is None else _entry("images", _images(calibration.images))),
         *_entry("alarm", alarm_statement(calibration.alarm)),
+        *([] if scale is None else _entry("difficulty", _difficulty(scale))),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
         *_entry("self-test", _selftest(calibration.selftest)),
         *_entry("backbone", calibration.provenance.backbone or "a network supplied as ONNX"),
@@ -79,6 +88,13 @@ def _selftest(test: SelfTest) -> str:
     return (
         f"{test.width}x{test.height}, {count} numbers within {test.tolerance:g}; widths of its "
         "sets below, m and rad"
+    )
+
+
+def _difficulty(spec: DifficultySpec) -> str:
+    return (
+        f"sets are {math.exp(spec.lowest):.2g} to {math.exp(spec.highest):.3g} times as wide as "
+        "usual, by the novelty of their frame"
     )
 
 

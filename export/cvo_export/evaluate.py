@@ -19,9 +19,10 @@ from cvo_edge.guarantee import by_level, left_out_text
 from cvo_edge.heads import HEADS
 from cvo_edge.odometer import Odometer
 from cvo_export.bundles.figures import Claim, Sets, point_error
+from cvo_export.bundles.observed import observe
 from cvo_export.bundles.online import Schedule, Stage, online, online_lines
 from cvo_export.bundles.rule import chosen_rule
-from cvo_export.bundles.thresholds import observe, with_thresholds
+from cvo_export.bundles.thresholds import with_thresholds
 from cvo_export.data.noise import Noise, noisy
 from cvo_export.data.splits import Split, same_split
 from cvo_export.datasets import PoseDataset

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from cvo_export import publish as publishing
-from cvo_export.bundles import alarm
+from cvo_export.bundles import alarm, difficulty
 from cvo_export.data.augment import AugmentConfig
 from cvo_export.datasets import synthetic
 from cvo_export.graph import familiarise, to_onnx
@@ -87,6 +87,7 @@ def _few_copies() -> Iterator[None]:
         for name, count in (("_FRAMES", 120), ("_HARMLESS", 15), ("_NOISY", 36), ("_CHECKED", 4)):
             patch.setattr(familiarise, name, count)
         patch.setattr(alarm, "_CHANGED_FRAMES", 25)
+        patch.setattr(difficulty, "_COPIES", 6)
         yield
 
 

@@ -16,7 +16,7 @@ from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import UsageError
 from cvo_edge.heads import CqrHead
-from cvo_export.bundles.thresholds import observe
+from cvo_export.bundles.observed import observe
 from cvo_export.evaluate import evaluate, find_level, table
 from cvo_export.networks.backbone import BackboneConfig
 from cvo_export.networks.baselines import BASELINES

@@ -18,7 +18,7 @@ from cvo_edge.errors import BundleMismatchError, CvoError, ModelError, SinkError
 from cvo_edge.geometry import mean_rotation
 from cvo_edge.programs.inspect import inspect_lines
 from cvo_edge.programs.selftest import check_selftest
-from cvo_export.bundles.thresholds import observe
+from cvo_export.bundles.observed import observe
 from cvo_export.calibrate import calibrate
 from cvo_export.cli import app
 from cvo_export.data.splits import make_split, same_split

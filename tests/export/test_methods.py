@@ -19,7 +19,7 @@ from cvo_edge.errors import GateError, UsageError
 from cvo_edge.output.sinks import Sink
 from cvo_edge.sets import scaled_distance
 from cvo_export import publish as publishing
-from cvo_export.bundles.thresholds import observe
+from cvo_export.bundles.observed import observe
 from cvo_export.evaluate import evaluate, find_level, table
 from cvo_export.networks.heads.cqr import CqrConfig
 from cvo_export.networks.heads.csp import (

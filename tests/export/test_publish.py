@@ -19,7 +19,7 @@ from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
 from cvo_edge.pose import about
 from cvo_edge.programs.selftest import check_selftest
-from cvo_export.bundles.thresholds import observe
+from cvo_export.bundles.observed import observe
 from cvo_export.graph.to_onnx import check_parity, export_onnx
 from cvo_export.networks.heads.cjp import CjpConfig, CjpLearner, CjpNetwork, CjpPrediction
 from cvo_export.publish import publish

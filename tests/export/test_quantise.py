@@ -16,7 +16,7 @@ from cvo_edge.engine.session import Session
 from cvo_edge.errors import UsageError
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.selftest import check_selftest
-from cvo_export.bundles.thresholds import observe
+from cvo_export.bundles.observed import observe
 from cvo_export.graph.quantise import quantised
 from cvo_export.graph.to_onnx import export_onnx
 from cvo_export.networks.backbone import Backbone, BackboneConfig

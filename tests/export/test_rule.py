@@ -5,8 +5,9 @@ import pytest
 
 from cvo_edge.conformal import capped_quantile, conformal_quantile
 from cvo_edge.errors import UsageError
+from cvo_export.bundles.observed import Scored
 from cvo_export.bundles.rule import chosen_rule
-from cvo_export.bundles.thresholds import Scored, thresholds
+from cvo_export.bundles.thresholds import thresholds
 
 CQR = {"half_width_floor": [0.01] * 6, "sides": "symmetric"}
 

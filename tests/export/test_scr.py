@@ -14,7 +14,7 @@ from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.heads import scr as scr_module
 from cvo_edge.heads.scr import ScrParameters
 from cvo_edge.pose_solver import NU
-from cvo_export.bundles.thresholds import observe
+from cvo_export.bundles.observed import observe
 from cvo_export.data import place as place_module
 from cvo_export.data.augment import AugmentConfig
 from cvo_export.datasets import open_dataset

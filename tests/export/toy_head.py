@@ -30,7 +30,7 @@ class ToyHead(Head):
     score_names = ("toy_distance",)
     outputs = {"pose": (1, 7)}  # noqa: RUF012 - declared like this in the protocol
 
-    def scores(
+    def plain_scores(
         self,
         outputs: Mapping[str, NDArray[Any]],
         point: NDArray[np.float64],
@@ -39,7 +39,7 @@ class ToyHead(Head):
     ) -> NDArray[np.float64]:
         return (np.abs(truth - point) / np.array(self.parameters.unit))[:, np.newaxis]
 
-    def conformal_set(
+    def plain_set(
         self,
         outputs: Mapping[str, NDArray[Any]],
         point: NDArray[np.float64],

@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
+from cvo_edge.bundle.format import DifficultySpec
 from cvo_edge.conformal import (
     LinearScale,
     capped_quantile,
     conformal_quantile,
     conformal_rank,
 )
-from cvo_export.bundles.thresholds import Scored, thresholds
+from cvo_export.bundles.observed import Scored
+from cvo_export.bundles.thresholds import thresholds
 
 REPEATS = 1000
 
@@ -223,6 +225,23 @@ def test_two_thresholds_at_half_the_miscoverage_cover_what_their_ranks_say(make_
         )
         covered.append((repeat[n:] <= q_hat).all(axis=1).mean())
     expected = 2 * conformal_rank(n, 1 - (1 - CONFIDENCE) / 2) / (n + 1) - 1
+    assert abs(np.mean(covered) - expected) < 4.5 * standard_error(expected, n)
+
+
+def test_a_difficulty_keeps_the_coverage_of_frames_like_those_of_the_calibration(make_head):
+    n = 100
+    head = make_head("cqr", "normalised", CQR).scaled(
+        DifficultySpec(weights=(0.5, 0.3, 0.0, -0.4), bias=0.1, lowest=-0.7, highest=1.5)
+    )
+    outputs, point, truth = frames(REPEATS * (n + TRIALS), n)
+    generator = np.random.default_rng(n)
+    outputs["novelty"] = np.exp(generator.standard_normal((len(truth), 4)))
+    scores = head.scores(outputs, point, truth).reshape(REPEATS, n + TRIALS, 6)
+    covered = [
+        (repeat[n:] <= np.array([conformal_quantile(s, CONFIDENCE) for s in repeat[:n].T])).mean()
+        for repeat in scores
+    ]
+    expected = conformal_rank(n, CONFIDENCE) / (n + 1)
     assert abs(np.mean(covered) - expected) < 4.5 * standard_error(expected, n)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -22,11 +22,9 @@ from cvo_edge.estimate import recorded_novelty
 from cvo_edge.monitor.alarm import Running, StreamAlarm, rank
 from cvo_edge.monitor.martingale import mean_novelty
 from cvo_edge.vocabulary import SplitKind
+from cvo_export.bundles.observed import Observed
 from cvo_export.data.harmless import harmlessly_changed
 from cvo_export.datasets import PoseDataset
-
-if TYPE_CHECKING:
-    from cvo_export.bundles.thresholds import Observed
 
 Array = NDArray[np.float64]
 

@@ -17,18 +17,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration
+from cvo_edge.bundle.format import Calibration, DifficultySpec
 from cvo_edge.heads import Candidate
 from cvo_export.bundles.alarm import Pair, fitted_alarm, tells, together, with_copies
+from cvo_export.bundles.choice import chosen, with_difficulty
+from cvo_export.bundles.difficulty import degraded
 from cvo_export.bundles.draft import Draft, images_of
-from cvo_export.bundles.thresholds import (
-    Observed,
-    Scored,
-    chosen,
-    completed,
-    first_head,
-    observe,
-)
+from cvo_export.bundles.observed import Observed, Scored, observe
+from cvo_export.bundles.thresholds import completed, first_head
 from cvo_export.datasets import PoseDataset
 
 Indices = NDArray[np.int64]
@@ -55,9 +51,12 @@ class Fold(NamedTuple):
             see = partial(observe, observer)
             return with_copies(see, dataset, self.draft.split, seen, whole=True)
 
-    def scored(self, seen: Observed, number: int) -> Scored:
-        """Return the scores of observed frames by the candidate of this number."""
-        return seen.scored(self.draft.head(self.candidates[number]))
+    def scored(self, seen: Observed, number: int, difficulty: DifficultySpec | None) -> Scored:
+        """Return the scores of observed frames by the candidate of this number.
+
+        ``difficulty`` is that of the bundle, for the statistics of the fold's own graph.
+        """
+        return seen.scored(self.draft.head(self.candidates[number]).scaled(difficulty))
 
 
 def calibrated_crossed(
@@ -82,15 +81,22 @@ def calibrated_crossed(
         val, *seen = (each.where(each.coloured) for each in (val, *seen))
     best = chosen(draft, val, candidates)
     number = [candidate is best for candidate in candidates].index(True)
-    scores = [fold.scored(each, number) for fold, each in zip(folds, seen, strict=True)]
-    cal = Scored(*(np.concatenate(parts) for parts in zip(*scores, strict=True)))
     head = draft.head(best)
     alarm = None
     if tells(val):
         with draft.observer(model_bytes, head) as observer:
-            known = with_copies(partial(observe, observer), dataset, draft.split, val)
+            given = partial(observe, observer), dataset, draft.split
+            known = with_copies(*given, val)
+            noisy = None if head.solves else degraded(*given, val.indices)
+        if noisy is not None:
+            draft = with_difficulty(draft, best, val, noisy)
+            head = draft.head(best)
         left_out = [
             fold.copied(dataset, each, number) for fold, each in zip(folds, seen, strict=True)
         ]
         alarm = fitted_alarm(draft.split.kind, known, together(left_out))
+    scores = [
+        fold.scored(each, number, draft.difficulty) for fold, each in zip(folds, seen, strict=True)
+    ]
+    cal = Scored(*(np.concatenate(parts) for parts in zip(*scores, strict=True)))
     return completed(draft, model_bytes, head, cal, val.scored(head), alarm)

@@ -20,6 +20,7 @@ from cvo_edge.bundle.format import (
     AlarmSpec,
     Calibration,
     CalibrationSpec,
+    DifficultySpec,
     ImageSpec,
     ModelSpec,
     PoseLimits,
@@ -93,6 +94,8 @@ class Draft:
         Their size and colour; None before they have been read.
     crossed
         Number of folds of a crossed calibration, or None.
+    difficulty
+        What scales the sets from frame to frame; None for nothing, and before it is fitted.
     """
 
     name: str
@@ -110,6 +113,7 @@ class Draft:
     images: ImageSpec | None = None
     cap: float | None = None
     crossed: int | None = None
+    difficulty: DifficultySpec | None = None
 
     @classmethod
     def of(cls, calibration: Calibration) -> Draft:
@@ -135,7 +139,7 @@ class Draft:
 
         Raises BundleMismatchError if the model does not have the tensors that the head needs.
         """
-        head = HEADS[self.method](candidate.parameters, candidate.score)
+        head = HEADS[self.method](candidate.parameters, candidate.score).scaled(self.difficulty)
         check_tensors(self.model, head)
         return head
 
@@ -193,6 +197,7 @@ class Draft:
             camera=self.camera,
             images=self.images,
             alarm=alarm,
+            difficulty=self.difficulty,
             digest=UNWRITTEN,
         )
 

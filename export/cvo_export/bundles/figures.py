@@ -17,7 +17,9 @@ from cvo_edge.conformal import conformal_rank, interval_score
 from cvo_edge.guarantee import statement
 from cvo_edge.odometer import Odometer
 from cvo_edge.sets import ConformalSet
-from cvo_export.bundles.thresholds import Observed, effective_frames, workspace
+from cvo_export.bundles.choice import workspace
+from cvo_export.bundles.observed import Observed
+from cvo_export.bundles.thresholds import effective_frames
 from cvo_export.bundles.volume import ellipsoids_log_volume
 from cvo_export.datasets import PoseDataset
 

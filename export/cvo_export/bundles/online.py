@@ -21,7 +21,7 @@ from cvo_edge.errors import UsageError
 from cvo_edge.monitor.adaptation import KEPT, Adaptation, error_bound, step
 from cvo_edge.odometer import Odometer
 from cvo_edge.vocabulary import SCOPES, Scope
-from cvo_export.bundles.thresholds import Observed
+from cvo_export.bundles.observed import Observed
 
 Array = NDArray[np.float64]
 

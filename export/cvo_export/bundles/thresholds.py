@@ -7,12 +7,9 @@ Coverage then does not depend on the fidelity of the export: the graph that runs
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -22,148 +19,28 @@ from cvo_edge.bundle.format import (
     CONFIDENCES,
     AlarmSpec,
     Calibration,
-    LeftOut,
-    PoseSpec,
-    SixOrUnbounded,
     Threshold,
 )
 from cvo_edge.conformal import (
     capped_quantile,
     conformal_quantile,
     effective_sample_size,
-    interval_score,
     recording_cap,
 )
-from cvo_edge.engine.observation import Observation, Observer
-from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.errors import UsageError
 from cvo_edge.heads import Candidate, Head
-from cvo_edge.input.image_checks import has_colour
-from cvo_edge.odometer import Odometer
-from cvo_edge.pose import about
 from cvo_edge.programs.selftest import observe_selftest
-from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import SCOPES, Joint, Rule, Scope
 from cvo_export.bundles.alarm import fitted_alarm, tells, with_copies
+from cvo_export.bundles.choice import chosen, with_difficulty
+from cvo_export.bundles.difficulty import degraded
 from cvo_export.bundles.draft import SELFTEST_SIZE, Counts, Draft, images_of
+from cvo_export.bundles.entries import entry_of, marginal_thresholds
+from cvo_export.bundles.observed import Observed, Scored, in_order, observe
 from cvo_export.bundles.rule import left_out
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
-
-
-# Margin by which another score must win on val; smaller differences may be chance.
-_CLEARLY = 0.05
-
-
-class Scored(NamedTuple):
-    """Scores of n frames per scope, (n, sides, 6), and the frames' sequence numbers (n,)."""
-
-    marginal: Array
-    joint: Array
-    sequence: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Observed:
-    """The runtime's results for the n frames that passed the frame checks, stacked.
-
-    ``outputs`` (n, ...) are the network's outputs by name; ``point`` and ``truth`` (n, 6) are in
-    the bundle's chart; ``pose`` and ``true_pose`` are (n, 7); all positions are relative to the
-    bundle's origin. ``sequence`` (n,) holds sequence numbers; ``coloured`` (n,) tells which images
-    have colour; ``size`` is width and height of the first image; ``invalid`` and ``degraded``
-    count the frames that the checks excluded.
-    """
-
-    indices: NDArray[np.int64]
-    outputs: dict[str, NDArray[np.float32]]
-    point: Array
-    truth: Array
-    pose: Array
-    true_pose: Array
-    sequence: NDArray[np.int64]
-    coloured: NDArray[np.bool_]
-    size: tuple[int, int]
-    invalid: int
-    degraded: int
-
-    def where(self, rows: NDArray[np.bool_]) -> Observed:
-        """Return the frames that a mask (n,) chooses; counts of excluded frames stay."""
-        chosen = {
-            name: getattr(self, name)[rows]
-            for name in ("indices", "point", "truth", "pose", "true_pose", "sequence", "coloured")
-        }
-        outputs = {name: values[rows] for name, values in self.outputs.items()}
-        return dataclasses.replace(self, outputs=outputs, **chosen)
-
-    def scored(self, head: Head) -> Scored:
-        """Return the scores of the true poses."""
-        marginal, joint = (
-            head.scores(self.outputs, self.point, self.truth, scope) for scope in SCOPES
-        )
-        return Scored(marginal, joint, self.sequence)
-
-    def sets(self, head: Head, entry: Threshold) -> list[ConformalSet]:
-        """Return the set of every frame at one threshold entry."""
-        return [
-            head.conformal_set(
-                {name: values[row : row + 1] for name, values in self.outputs.items()},
-                point,
-                entry,
-            )
-            for row, point in enumerate(self.point)
-        ]
-
-
-def observe(
-    observer: Observer | Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
-) -> Observed:
-    """Run frames of a data set through a network, in order.
-
-    Raises SourceError if no frame passes the checks.
-    """
-    kept: list[int] = []
-    seen: list[Observation] = []
-    reasons: Counter[str] = Counter()
-    invalid = degraded = 0
-    for index in indices.tolist():
-        try:
-            image = dataset.read_image(index)
-        except SourceError:
-            image = None  # flagged as invalid, as on the device
-        observation = observer.observe(image, seq=index)
-        problem = observation.fault or observation.doubt
-        if problem is None:
-            kept.append(index)
-            seen.append(observation)
-            continue
-        reasons[problem] += 1
-        invalid += observation.fault is not None
-        degraded += observation.fault is None
-    if not seen:
-        found = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-        raise SourceError(
-            f"{dataset.name}: expected frames that pass the frame checks, found none of "
-            f"{len(indices)}: {found}"
-        )
-    pose = np.array([observation.pose for observation in seen])
-    looks = [observation.look for observation in seen if observation.look is not None]
-    true_pose = about(dataset.poses[kept], observer.origin_m)
-    return Observed(
-        indices=np.array(kept),
-        outputs={
-            name: np.concatenate([observation.outputs[name] for observation in seen])
-            for name in seen[0].outputs
-        },
-        point=np.array([observation.point for observation in seen]),
-        truth=observer.chart.coordinates(true_pose, pose),
-        pose=pose,
-        true_pose=true_pose,
-        sequence=dataset.sequence[kept],
-        coloured=np.array([has_colour(look) for look in looks]),
-        size=(looks[0].size[1], looks[0].size[0]),
-        invalid=invalid,
-        degraded=degraded,
-    )
 
 
 def calibrated(
@@ -175,8 +52,9 @@ def calibrated(
 ) -> Calibration:
     """Calibrate a draft: run its model on val and cal, choose a score, compute thresholds.
 
-    The val frames choose among the candidates (see ``chosen``) and scale the degrees of freedom
-    for the joint scope; the cal frames give the thresholds.
+    The val frames choose among the candidates (see ``chosen``), scale the degrees of freedom for
+    the joint scope and, with noisy copies of them, decide on a difficulty (see
+    ``with_difficulty``); the cal frames give the thresholds.
 
     Raises
     ------
@@ -202,7 +80,8 @@ def calibrated(
         )
         for candidate in candidates
     ]
-    head = draft.head(chosen(draft, val, candidates))
+    best = chosen(draft, val, candidates)
+    head = draft.head(best)
     if head.solves:
         # What was tuned may have changed what the solver finds.
         with draft.observer(model_bytes, head) as observer:
@@ -213,7 +92,11 @@ def calibrated(
         with draft.observer(model_bytes, head) as observer:
             given = partial(observe, observer), dataset, draft.split
             copies = with_copies(*given, val), with_copies(*given, cal, whole=True)
+            noisy = None if head.solves else degraded(*given, val.indices)
         alarm = fitted_alarm(draft.split.kind, *copies)
+        if noisy is not None:
+            draft = with_difficulty(draft, best, val, noisy)
+            head = draft.head(best)
     return completed(draft, model_bytes, head, cal.scored(head), val.scored(head), alarm)
 
 
@@ -247,16 +130,6 @@ def completed(
     return draft.calibrated(head, found, counts(cal), selftest, alarm)
 
 
-def in_order(*observed: Observed) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
-    """Return outputs and sequence numbers of several roles, stacked in the data set's order."""
-    order = np.argsort(np.concatenate([each.indices for each in observed]))
-    outputs = {
-        name: np.concatenate([each.outputs[name] for each in observed])[order]
-        for name in observed[0].outputs
-    }
-    return outputs, np.concatenate([each.sequence for each in observed])[order]
-
-
 def with_thresholds(
     calibration: Calibration, head: Head, val: Observed, cal: Observed
 ) -> Calibration:
@@ -287,37 +160,6 @@ def counts(cal: Scored) -> Counts:
         sequences=len(np.unique(cal.sequence)),
         effective=round(effective_frames(cal), 1),
     )
-
-
-def chosen(draft: Draft, val: Observed, candidates: Sequence[Candidate]) -> Candidate:
-    """Return the candidate to use: the first, unless another is clearly better on val.
-
-    Candidates are compared by the interval score at 0.9 over each DoF's standard deviation, with
-    thresholds from val itself; val is too small to separate closer candidates.
-    """
-    results = []
-    for candidate in candidates:
-        head = draft.head(candidate)
-        scores = head.scores(val.outputs, val.point, val.truth)
-        entry = _threshold(0.9, "marginal", marginal_thresholds(head, scores, 0.9, _pooled))
-        limits = workspace(draft.pose)
-        sets = [each.within(*limits) for each in val.sets(head, entry)]
-        width = np.array([each.width() for each in sets])
-        distance = np.array([each.distance(y) for each, y in zip(sets, val.truth, strict=True)])
-        deviation = np.array(draft.pose.standard_deviation)
-        results.append(float((interval_score(width, distance, 0.1) / deviation).mean()))
-    best = int(np.argmin(results))
-    return candidates[best if results[best] < (1.0 - _CLEARLY) * results[0] else 0]
-
-
-def workspace(pose: PoseSpec) -> tuple[Array, Array]:
-    """Return the lowest and highest value per DoF, (6,) each, that replace unbounded sides."""
-    limits = pose.limits
-    lowest, highest = np.array(limits.lowest), np.array(limits.highest)
-    if pose.rotation == "tangent_predicted":
-        # Offsets from the prediction: at most half a turn.
-        lowest[3:], highest[3:] = -np.pi, np.pi
-    return lowest, highest
 
 
 def thresholds(
@@ -354,19 +196,8 @@ def thresholds(
         at = partial(found, confidence, scope)
         compared = cal.joint if scope == "joint" and joint == "max" else cal.marginal
         left = left_out(compared, cal.sequence, used, scope, at)
-        entries.append(_threshold(confidence, scope, at(np.full(len(largest), True)), left))
+        entries.append(entry_of(confidence, scope, at(np.full(len(largest), True)), left))
     return tuple(entries)
-
-
-def marginal_thresholds(
-    head: Head, scores: Array, confidence: float, q_hat: Callable[[Array, float], float]
-) -> Array:
-    """Return thresholds (sides, 6) from scores (n, sides, 6); infinite where unbounded."""
-    found = np.full(scores.shape[1:], np.inf)
-    for side, level in enumerate(head.side_confidences(confidence)):
-        if level is not None:
-            found[side] = [q_hat(scores[:, side, dof], level) for dof in range(6)]
-    return found
 
 
 def effective_frames(scored: Scored) -> float:
@@ -388,26 +219,3 @@ def effective_frames(scored: Scored) -> float:
 
 def _used_sides(head: Head) -> NDArray[np.bool_]:
     return np.array([level is not None for level in head.side_confidences(0.9)])
-
-
-def _pooled(scores: Array, confidence: float) -> float:
-    return conformal_quantile(scores, confidence)
-
-
-def _threshold(
-    confidence: float, scope: Scope, values: Array, left: LeftOut | None = None
-) -> Threshold:
-    """Convert thresholds (sides, 6), infinite where unbounded, to a stored entry."""
-    sides = [_six_or_unbounded(row) for row in values]
-    return Threshold(
-        confidence=confidence,
-        scope=scope,
-        q_hat=sides[0],
-        q_hat_upper=sides[1] if len(sides) == 2 else None,
-        left_out=left,
-    )
-
-
-def _six_or_unbounded(values: Array) -> SixOrUnbounded:
-    a, b, c, d, e, f = (float(value) if np.isfinite(value) else None for value in values)
-    return (a, b, c, d, e, f)

@@ -22,6 +22,9 @@ from cvo_export.scene.sensor import streak
 
 Image = NDArray[np.uint8]
 
+# Drawn noises have this share of the default strength and more.
+_MILDEST = 0.3
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -76,6 +79,11 @@ def parse_noise(text: str) -> Noise:
         return Noise(name, float(digits))
     except ValueError:
         raise _out_of_range(name, repr(digits)) from None
+
+
+def drawn(name: str, generator: np.random.Generator) -> Noise:
+    """Draw a strength for a kind of noise: 0.3 to 1 of its default, as mild noise matters, too."""
+    return Noise(name, KINDS[name].default * generator.uniform(_MILDEST, 1.0))
 
 
 def noisy(dataset: PoseDataset, noise: Noise, seed: int) -> PoseDataset:

@@ -16,7 +16,7 @@ from cvo_edge.bundle.format import DEGRADATION_OUTPUT, NOVELTY_OUTPUT
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError, SourceError
 from cvo_export.data.harmless import HARMLESS
-from cvo_export.data.noise import KINDS, Noise
+from cvo_export.data.noise import KINDS, drawn
 from cvo_export.datasets import PoseDataset
 from cvo_export.graph.familiarity import Familiarity, Image8, fitted, neighbours, spread_pairs
 from cvo_export.graph.familiarity_nodes import CELLS, PIXELS, with_familiarity
@@ -26,8 +26,6 @@ Change = Callable[[Image8, np.random.Generator], Image8]
 
 # Training frames behind the statistics, and copies of them.
 _FRAMES, _HARMLESS, _NOISY = 1200, 150, 600
-# Noisy copies have this share of the default strength and more: mild noise is to be noticed, too.
-_MILDEST = 0.3
 _CHECKED = 16
 # A distance to the nearest frame is the root of a difference of large numbers.
 _TOLERANCE = 1e-2
@@ -91,11 +89,8 @@ def _noises(generator: np.random.Generator) -> list[Change]:
     """Return the study's kinds of noise in turn, each at several strengths."""
 
     def at(name: str) -> Change:
-        kind = KINDS[name]
-
         def change(image: Image8, random: np.random.Generator) -> Image8:
-            strength = kind.default * generator.uniform(_MILDEST, 1.0)
-            return Noise(name, strength).degrade(image, random)
+            return drawn(name, generator).degrade(image, random)
 
         return change
 

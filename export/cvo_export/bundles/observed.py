@@ -1,0 +1,145 @@
+"""Frames of a data set as the runtime sees them: a network's outputs, and scores of the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.bundle.format import Threshold
+from cvo_edge.engine.observation import Observation, Observer
+from cvo_edge.errors import SourceError
+from cvo_edge.heads import Head
+from cvo_edge.input.image_checks import has_colour
+from cvo_edge.odometer import Odometer
+from cvo_edge.pose import about
+from cvo_edge.sets import ConformalSet
+from cvo_edge.vocabulary import SCOPES
+from cvo_export.datasets import PoseDataset
+
+Array = NDArray[np.float64]
+
+
+class Scored(NamedTuple):
+    """Scores of n frames per scope, (n, sides, 6), and the frames' sequence numbers (n,)."""
+
+    marginal: Array
+    joint: Array
+    sequence: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """The runtime's results for the n frames that passed the frame checks, stacked.
+
+    ``outputs`` (n, ...) are the network's outputs by name; ``point`` and ``truth`` (n, 6) are in
+    the bundle's chart; ``pose`` and ``true_pose`` are (n, 7); all positions are relative to the
+    bundle's origin. ``sequence`` (n,) holds sequence numbers; ``coloured`` (n,) tells which images
+    have colour; ``size`` is width and height of the first image; ``invalid`` and ``degraded``
+    count the frames that the checks excluded.
+    """
+
+    indices: NDArray[np.int64]
+    outputs: dict[str, NDArray[np.float32]]
+    point: Array
+    truth: Array
+    pose: Array
+    true_pose: Array
+    sequence: NDArray[np.int64]
+    coloured: NDArray[np.bool_]
+    size: tuple[int, int]
+    invalid: int
+    degraded: int
+
+    def where(self, rows: NDArray[np.bool_]) -> Observed:
+        """Return the frames that a mask (n,) chooses; counts of excluded frames stay."""
+        chosen = {
+            name: getattr(self, name)[rows]
+            for name in ("indices", "point", "truth", "pose", "true_pose", "sequence", "coloured")
+        }
+        outputs = {name: values[rows] for name, values in self.outputs.items()}
+        return dataclasses.replace(self, outputs=outputs, **chosen)
+
+    def scored(self, head: Head) -> Scored:
+        """Return the scores of the true poses."""
+        marginal, joint = (
+            head.scores(self.outputs, self.point, self.truth, scope) for scope in SCOPES
+        )
+        return Scored(marginal, joint, self.sequence)
+
+    def sets(self, head: Head, entry: Threshold) -> list[ConformalSet]:
+        """Return the set of every frame at one threshold entry."""
+        return [
+            head.conformal_set(
+                {name: values[row : row + 1] for name, values in self.outputs.items()},
+                point,
+                entry,
+            )
+            for row, point in enumerate(self.point)
+        ]
+
+
+def observe(
+    observer: Observer | Odometer, dataset: PoseDataset, indices: NDArray[np.int64]
+) -> Observed:
+    """Run frames of a data set through a network, in order.
+
+    Raises SourceError if no frame passes the checks.
+    """
+    kept: list[int] = []
+    seen: list[Observation] = []
+    reasons: Counter[str] = Counter()
+    invalid = degraded = 0
+    for index in indices.tolist():
+        try:
+            image = dataset.read_image(index)
+        except SourceError:
+            image = None  # flagged as invalid, as on the device
+        observation = observer.observe(image, seq=index)
+        problem = observation.fault or observation.doubt
+        if problem is None:
+            kept.append(index)
+            seen.append(observation)
+            continue
+        reasons[problem] += 1
+        invalid += observation.fault is not None
+        degraded += observation.fault is None
+    if not seen:
+        found = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+        raise SourceError(
+            f"{dataset.name}: expected frames that pass the frame checks, found none of "
+            f"{len(indices)}: {found}"
+        )
+    pose = np.array([observation.pose for observation in seen])
+    looks = [observation.look for observation in seen if observation.look is not None]
+    true_pose = about(dataset.poses[kept], observer.origin_m)
+    return Observed(
+        indices=np.array(kept),
+        outputs={
+            name: np.concatenate([observation.outputs[name] for observation in seen])
+            for name in seen[0].outputs
+        },
+        point=np.array([observation.point for observation in seen]),
+        truth=observer.chart.coordinates(true_pose, pose),
+        pose=pose,
+        true_pose=true_pose,
+        sequence=dataset.sequence[kept],
+        coloured=np.array([has_colour(look) for look in looks]),
+        size=(looks[0].size[1], looks[0].size[0]),
+        invalid=invalid,
+        degraded=degraded,
+    )
+
+
+def in_order(*observed: Observed) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
+    """Return outputs and sequence numbers of several roles, stacked in the data set's order."""
+    order = np.argsort(np.concatenate([each.indices for each in observed]))
+    outputs = {
+        name: np.concatenate([each.outputs[name] for each in observed])[order]
+        for name in observed[0].outputs
+    }
+    return outputs, np.concatenate([each.sequence for each in observed])[order]
