@@ -1,5 +1,8 @@
 """Augmentation by camera rotation: the homography matches the label."""
 
+import dataclasses
+from pathlib import Path
+
 import cv2
 import msgspec
 import numpy as np
@@ -12,10 +15,16 @@ from cvo_export.data.augment import (
     augmented,
     blur,
     change_light,
+    noisy_copy,
     rotate_camera,
 )
-from cvo_export.datasets import Intrinsics
+from cvo_export.datasets import Intrinsics, PoseDataset, open_dataset
 from cvo_export.scene.room import room
+from cvo_export.training.features import ModelImages, cached_copies
+from cvo_export.training.material import shared_folder
+from cvo_export.training.run import decode_config
+
+from .conftest import DATASET, tiny_config
 
 SIZE = (320, 240)
 K = Intrinsics(292.5, 292.5, 159.5, 119.5)
@@ -119,3 +128,67 @@ def test_blur_keeps_the_mean_and_every_third_image_has_it():
     changed = [not np.array_equal(each, image) for each in blurred]
     assert 70 < sum(changed) < 130
     assert np.mean(blurred) == pytest.approx(image.mean(), rel=0.02)
+
+
+# -- noise --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def model_images():
+    """Model inputs of a quarter of the camera's pixels."""
+    generator = np.random.default_rng(0)
+    coarse = generator.integers(60, 190, (12, 6, 8, 3)).astype(np.uint8)
+    frames = [cv2.resize(each, (64, 48), interpolation=cv2.INTER_CUBIC) for each in coarse]
+    poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (12, 1))
+    names = tuple(map(str, range(12)))
+    dataset = PoseDataset("noise", poses, np.zeros(12, int), ("one",), names, frames.__getitem__)
+    return ModelImages(dataset, np.arange(12), 24, 32, "none")
+
+
+def copies_of(images, folder, noise, copies=4, seed=3):
+    still = AugmentConfig(rotation_deg=0.0, light=0.0)
+    found, _ = cached_copies(
+        folder, images, lambda image: image, still, copies, seed, lambda *_: None, noise
+    )
+    return found.astype(int)
+
+
+def test_a_share_of_the_copies_has_noise_and_the_first_copy_none(model_images, tmp_path):
+    clean = model_images.images.astype(int)
+    without = copies_of(model_images, tmp_path / "without", 0.0)
+    np.testing.assert_array_equal(without, np.broadcast_to(clean, without.shape))
+    half = copies_of(model_images, tmp_path / "half", 0.5, copies=20)
+    np.testing.assert_array_equal(half[0], clean)
+    changed = (half[1:] != clean).any(axis=(2, 3, 4))
+    # Four deviations of a binomial of 240.
+    assert abs(changed.mean() - 0.5) < 0.13
+    again = copies_of(model_images, tmp_path / "again", 0.5)
+    np.testing.assert_array_equal(again, half[:5])
+    whole = copies_of(model_images, tmp_path / "whole", 1.0)
+    assert (whole[1:] != clean).any(axis=(2, 3, 4)).all()
+    other = copies_of(model_images, tmp_path / "other", 1.0, seed=4)
+    assert (other[1:] != whole[1:]).any()
+
+
+def test_noise_has_the_size_of_the_cameras_pixels():
+    grey = np.full((120, 160, 3), 128, np.uint8)
+    spread = []
+    for pixels in (1.0, 4.0):
+        copies = [noisy_copy(grey, pixels, np.random.default_rng(seed)) for seed in range(40)]
+        assert {each.shape for each in copies} == {grey.shape}
+        spread.append([np.diff(each.astype(float), axis=1).std() for each in copies])
+    # Averages of 16 camera pixels have a quarter of their deviation; the kinds are the same.
+    fine, coarse = np.array(spread)
+    grainy = (fine > 10.0) & (coarse < 0.5 * fine)
+    assert grainy.sum() >= 10
+    np.testing.assert_allclose(coarse[grainy] / fine[grainy], 0.25, atol=0.08)
+
+
+def test_features_with_noise_are_cached_apart_and_configurations_without_it_are_as_before():
+    plain = tiny_config()
+    changed = dataclasses.replace(plain, noise=0.5)
+    assert "noise" not in msgspec.json.decode(msgspec.json.encode(plain))
+    assert decode_config(msgspec.json.encode(changed)).noisy == 0.5
+    assert plain.noisy == 0.0
+    images = ModelImages(open_dataset(DATASET), np.arange(2), 48, 64, "none")
+    assert shared_folder(Path(), plain, "0", images) != shared_folder(Path(), changed, "0", images)

@@ -217,6 +217,9 @@ def test_an_option_of_another_method_is_refused():
     ):
         configure(**options(method="csp", head={"trees": 5}))
     assert configure(**options(method="cqr", head={"trees": 5, "classes": None})).head.trees == 5
+    with pytest.raises(UsageError, match="noise: expected a method that trains a head on features"):
+        configure(**options(method="scr", noise=0.5))
+    assert configure(**options(copies=2, noise=0.0)) == configure(**options(copies=2))
 
 
 @pytest.mark.parametrize(

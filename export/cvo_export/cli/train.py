@@ -58,6 +58,15 @@ def _train(
             min=0, help="Lighting changes in the copies, 0 to 1; default: 1.", rich_help_panel=DATA
         ),
     ] = None,
+    noise: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Share of the copies that has one of the study's noises; default: 0.",
+            rich_help_panel=DATA,
+        ),
+    ] = None,
     cache: Annotated[
         Path | None,
         typer.Option(
@@ -133,6 +142,7 @@ def _train(
         fine_tune=fine_tune,
         steps=steps,
         folds=folds,
+        noise=noise,
         head=options,
     )
     with show_progress() as progress:

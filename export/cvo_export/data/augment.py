@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from cvo_edge import geometry
 from cvo_edge.camera import Camera
+from cvo_export.data.noise import KINDS, drawn
 from cvo_export.scene.sensor import streak
 
 Image = NDArray[np.uint8]
@@ -137,6 +138,22 @@ def blur(image: Image, longest_px: float, generator: np.random.Generator) -> Ima
     kernel = streak(shift, 2 * math.ceil(length) + 1)
     blurred = cv2.filter2D(image, cv2.CV_8U, kernel, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(blurred, dtype=np.uint8)
+
+
+def noisy_copy(image: Image, pixels: float, generator: np.random.Generator) -> Image:
+    """Degrade a model input (height, width, 3) by one of the study's noises, at a drawn strength.
+
+    ``pixels`` is the number of pixels of the camera image per pixel of the input along a side: the
+    noise is added to an image of the camera's size, as resizing averages part of it out.
+    """
+    names = tuple(KINDS)
+    noise = drawn(names[generator.integers(len(names))], generator)
+    height, width = image.shape[:2]
+    size = round(max(1.0, pixels) * width), round(max(1.0, pixels) * height)
+    large = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+    degraded = noise.degrade(large, generator)
+    small = cv2.resize(degraded, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.uint8)
 
 
 def augmented(

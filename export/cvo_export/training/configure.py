@@ -54,6 +54,13 @@ def configure(
         normalisation = "timm" if weights in (TIMM_WEIGHTS, NO_WEIGHTS) else "half"
     numbers: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     defaults = TRAINABLE[method]
+    if not numbers.get("noise", 1.0):
+        del numbers["noise"]
+    if "noise" in numbers and defaults.cells:
+        known = ", ".join(name for name, each in TRAINABLE.items() if not each.cells)
+        raise UsageError(
+            f"noise: expected a method that trains a head on features ({known}), found {method}"
+        )
     augment = {key: numbers.pop(key) for key in ("rotation_deg", "light") if key in numbers}
     if "copies" not in numbers:
         numbers["copies"] = _copies(defaults, dataset, width * height)

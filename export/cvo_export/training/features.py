@@ -25,7 +25,7 @@ from cvo_edge.files import whole_file
 from cvo_edge.input import preprocess
 from cvo_edge.input.view import crop_view
 from cvo_edge.vocabulary import Crop
-from cvo_export.data.augment import AugmentConfig, augmented
+from cvo_export.data.augment import AugmentConfig, augmented, noisy_copy
 from cvo_export.datasets import PoseDataset
 from cvo_export.graph.to_onnx import export_onnx
 from cvo_export.progress import Progress
@@ -61,6 +61,10 @@ class ModelImages:
             if image is None:
                 raise SourceError(f"{dataset.frame_names[index]}: expected a colour image")
             self.images[row] = preprocess.model_input(image, height, width, crop)[0]
+            if not row:
+                size = image.shape[0], image.shape[1]
+                # Camera pixels per pixel of the input along a side.
+                self._pixels = 1.0 / crop_view(*size, height, width, crop).enlarged
 
     def __len__(self) -> int:
         return len(self.images)
@@ -70,11 +74,22 @@ class ModelImages:
         return hashlib.sha256(self.images.tobytes()).hexdigest()
 
     def augmented(
-        self, row: int, config: AugmentConfig, generator: np.random.Generator, zoom: float = 1.0
+        self,
+        row: int,
+        config: AugmentConfig,
+        generator: np.random.Generator,
+        zoom: float = 1.0,
+        noise: float = 0.0,
     ) -> tuple[Image, Array]:
-        """Return an augmented copy of one image and its exact pose (7,)."""
+        """Return an augmented copy of one image and its exact pose (7,).
+
+        ``noise`` is the probability that it is also degraded by one of the study's noises.
+        """
         image, pose = self.images[row], self.poses[row]
-        return augmented(image, pose, self.camera, config, generator, zoom)
+        image, pose = augmented(image, pose, self.camera, config, generator, zoom)
+        if noise > 0.0 and generator.random() < noise:
+            image = noisy_copy(image, self._pixels, generator)
+        return image, pose
 
 
 class FeatureExtractor:
@@ -119,9 +134,11 @@ def cached_copies(
     copies: int,
     seed: int,
     progress: Progress,
+    noise: float = 0.0,
 ) -> tuple[NDArray[np.float16], Array]:
     """Features (copies + 1, n, ...) and poses (copies + 1, n, 7); copy 0 is not augmented.
 
+    ``noise`` is the share of the others that is degraded by one of the study's noises.
     Each copy is a separate file, written atomically, so that an interrupted run resumes with
     the next copy.
     """
@@ -133,7 +150,8 @@ def cached_copies(
         found = _stored(path, len(images))
         if found is None:
             graded = config.graded(number / max(1, copies))
-            found = _one_copy(images, extractor, graded, (seed, number), zooms[number])
+            share = noise if number else 0.0
+            found = _one_copy(images, extractor, graded, (seed, number), zooms[number], share)
             _store(path, found)
         if not number:
             features = np.empty((copies + 1, *found["features"].shape), np.float16)
@@ -164,10 +182,12 @@ def _one_copy(
     config: AugmentConfig,
     seed: tuple[int, int],
     zoom: float,
+    noise: float,
 ) -> dict[str, NDArray[Any]]:
     def one(row: int) -> tuple[NDArray[np.float16], Array]:
         # A generator per image makes the result independent of the processing order.
-        image, pose = images.augmented(row, config, np.random.default_rng((*seed, row)), zoom)
+        generator = np.random.default_rng((*seed, row))
+        image, pose = images.augmented(row, config, generator, zoom, noise)
         return extractor(image).astype(np.float16), pose
 
     # OpenCV and onnxruntime release the GIL, so threads can process whole images.

@@ -106,9 +106,9 @@ class Lesson:
 
         def batch(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
             rows = self.rows[generator.integers(self.rows.size, size=_IMAGE_BATCH)]
-            augment = self.config.augment
+            augment, noise = self.config.augment, self.config.noisy
             drawn = [
-                images.augmented(row, augment.graded(generator.random()), generator)
+                images.augmented(row, augment.graded(generator.random()), generator, noise=noise)
                 for row in rows.tolist()
             ]
             y = self.material.target.standardised(np.stack([pose for _, pose in drawn]))

@@ -198,6 +198,7 @@ def prepare_features(config: TrainConfig, cache: Path, progress: Progress) -> No
         config.copies,
         config.seed,
         progress,
+        config.noisy,
     )
 
 

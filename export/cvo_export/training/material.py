@@ -71,6 +71,7 @@ class Material:
                 config.copies,
                 config.seed,
                 self.progress,
+                config.noisy,
             )
             self._cached = {phase: (features, poses, torch.from_numpy(val))}
         return self._cached[phase]
@@ -97,5 +98,7 @@ def shared_folder(
         "pixels": images.digest(),
         "poses": images.poses.tolist(),
     }
+    if config.noisy:
+        decisive["noise"] = config.noisy
     text = json.dumps(decisive, sort_keys=True)
     return cache / hashlib.sha256(text.encode()).hexdigest()[:24]

@@ -70,6 +70,9 @@ class TrainConfig:
         Folds of a crossed run, where the recordings of train, fit and cal all train and calibrate.
         Unset by default, which leaves ``config.json`` and the names of a study's cells as they
         were.
+    noise
+        Share of the augmented copies that is degraded by one of the study's noises, each at 0.3 to
+        1 of its default strength; unset by default, too.
     """
 
     dataset: str
@@ -93,11 +96,17 @@ class TrainConfig:
     backbone_learning_rate: float = 3e-4
     share: Annotated[float, Meta(gt=0, le=1)] = 1.0
     folds: Annotated[int, Meta(ge=2)] | UnsetType = UNSET
+    noise: Annotated[float, Meta(gt=0, le=1)] | UnsetType = UNSET
 
     @property
     def crossed(self) -> int:
         """Number of folds of a crossed run; 0 for others."""
         return 0 if self.folds is UNSET else self.folds
+
+    @property
+    def noisy(self) -> float:
+        """Share of the augmented copies that have noise; 0 for most runs."""
+        return 0.0 if self.noise is UNSET else self.noise
 
     @property
     def method(self) -> str:
