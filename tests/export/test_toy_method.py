@@ -54,6 +54,7 @@ def bundle(_registered, tmp_path_factory):
     call(
         training.app,
         *("train", "toy", DATASET, folder / "run", "--split", "random", "--toy-noise", "0.3"),
+        *("--seed", "1"),
         *SMALL,
     )
     options = json.loads((folder / "run/config.json").read_bytes())["head"]
