@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -115,9 +117,13 @@ def track(
 ) -> Track:
     """Run the frames of a subset, or those of one sequence in it, through a bundle.
 
+    As in ``evaluate``, the stream is not watched: neither the alarm nor the stream checks take an
+    interval away.
+
     Raises UsageError for an unknown sequence and SourceError if no frame has a pose.
     """
     bundle = read_bundle(bundle_dir)
+    bundle = replace(bundle, calibration=msgspec.structs.replace(bundle.calibration, alarm=None))
     camera = dataset.camera() if bundle.head.solves else None
     with Odometer(bundle, confidence=confidence, scope=scope, camera=camera) as odometer:
         indices = subset_indices(odometer.calibration, dataset, subset)
@@ -142,8 +148,7 @@ def _step(odometer: Odometer, dataset: PoseDataset, index: int) -> PoseInterval:
         image: Any = dataset.read_image(index)
     except SourceError:
         image = None
-    # One stream per frame: the frames need not be consecutive, and stream checks must not flag
-    # them here, because `evaluate` does not apply stream checks either.
+    # One stream per frame: the frames need not be consecutive.
     frame = Frame(image, None, dataset.frame_names[index], 0.0)
     (estimate,) = odometer.stream([frame])
     return estimate
