@@ -34,6 +34,7 @@ from cvo_export.bundles.draft import (
 from cvo_export.bundles.rule import chosen_rule
 from cvo_export.bundles.thresholds import calibrated
 from cvo_export.bundles.writing import check_target, write_bundle
+from cvo_export.datasets.base import remembered
 from cvo_export.datasets.sizes import one_size
 from cvo_export.graph.familiarise import familiarised
 from cvo_export.graph.familiarity_nodes import CELLS, PIXELS
@@ -87,6 +88,7 @@ def publish(
     """
     check_target(bundle_dir)
     one_size(run.dataset)
+    run = replace(run, dataset=remembered(run.dataset))
     candidates = selected(run.graph.head.candidates(), score, sides)
     rule, cap = chosen_rule(rule, cap, run.split.kind)
     model_bytes, parity = _export(run, run.graph.head, run.training_frames, precision)

@@ -94,9 +94,9 @@ def _few_copies() -> Iterator[None]:
 _PICTURES: dict[Any, Any] = {}
 
 
-@pytest.fixture(scope="module")
-def drawn_once() -> Iterator[None]:
-    """Draw each picture of the scene once, for modules that train on the same scene many times."""
+@pytest.fixture(scope="session", autouse=True)
+def _drawn_once() -> Iterator[None]:
+    """Draw each picture of the scene once: many tests train on the same scene."""
     draw = synthetic._Flight.photograph
 
     def photograph(flight: Any, frame: int, intrinsics: Any, size: tuple[int, int]) -> Any:

@@ -229,7 +229,6 @@ def test_the_run_is_remembered_when_a_bundle_comes_back_to_its_own_data(
     assert after.calibration.n == before.calibration.n
 
 
-@pytest.mark.usefixtures("drawn_once")
 def test_a_network_of_a_far_place_answers_about_a_given_origin(tmp_path):
     dataset = open_dataset("synthetic:room,flights=4,frames=10,size=64x48,seed=4")
     path, utm_m = tmp_path / "own.onnx", (5e5, 5e6, 100.0)

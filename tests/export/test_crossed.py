@@ -28,8 +28,6 @@ from cvo_export.training.run import PoseGraph, load_run
 from .conftest import ignore_progress, tiny_config
 from .test_train import InterruptedTrainingError, stopping_after
 
-pytestmark = pytest.mark.usefixtures("drawn_once")
-
 FOLDS, STEPS = 2, 12
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from cvo_edge.errors import SourceError
 from cvo_export.calibrate import calibrate
-from cvo_export.datasets import open_dataset
-from cvo_export.datasets.base import Intrinsics
+from cvo_export.datasets import base, open_dataset
+from cvo_export.datasets.base import Intrinsics, PoseDataset, remembered
 from cvo_export.datasets.describe import describe, summary
 from cvo_export.datasets.frames import FrameList
 from cvo_export.datasets.poses import quaternion_pose
@@ -170,3 +170,23 @@ def test_a_quaternion_far_from_unit_norm_is_no_rotation(scale, valid):
     assert (found is not None) == valid
     if found is not None:
         np.testing.assert_allclose(found, [1, 2, 3, -0.5, 0.5, -0.5, 0.5], atol=1e-12)
+
+
+def test_an_image_that_is_remembered_is_read_once_and_cannot_be_spoilt(monkeypatch):
+    reads = []
+
+    def read_image(index):
+        reads.append(index)
+        return np.full((4, 4, 3), index, np.uint8)
+
+    poses = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (3, 1))
+    plain = PoseDataset("x", poses, np.zeros(3, np.int64), ("a",), ("0", "1", "2"), read_image)
+    monkeypatch.setattr(base, "_MOST", 2 * 48)
+    dataset = remembered(plain)
+    for _ in range(2):
+        for index in range(3):
+            image = dataset.read_image(index)
+            assert (image == index).all()
+            image[:] = 9
+    # The third image is beyond the memory that is allowed.
+    assert reads == [0, 1, 2, 2]

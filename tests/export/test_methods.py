@@ -41,8 +41,6 @@ from cvo_export.training.run import load_run
 from .conftest import DATASET, ignore_progress, tiny_config
 from .test_train import InterruptedTrainingError, same_weights, stopping_after
 
-pytestmark = pytest.mark.usefixtures("drawn_once")
-
 CONFIGS = {
     "cqr": CqrConfig(trees=20, components=8, forest_copies=1),
     "csp": CspConfig(classes=12, label_sigma=1.5),

@@ -28,8 +28,6 @@ from cvo_export.training.loop import train
 
 from .conftest import ignore_progress, tiny_config
 
-pytestmark = pytest.mark.usefixtures("drawn_once")
-
 
 def test_a_fresh_bundle_passes_its_own_self_test(tiny_bundle):
     with Odometer.load(tiny_bundle) as odometer:

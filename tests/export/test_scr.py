@@ -35,8 +35,6 @@ from cvo_export.training.run import load_run
 from .conftest import ignore_progress, tiny_config
 from .test_train import InterruptedTrainingError, same_weights, stopping_after
 
-pytestmark = pytest.mark.usefixtures("drawn_once")
-
 SCENE = "synthetic:room,flights=6,frames=30,size=192x144"
 CONFIGS = {
     "scr": ScrConfig(width=48, blocks=1, cell_steps=60),

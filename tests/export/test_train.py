@@ -16,8 +16,6 @@ from cvo_export.training.run import load_run
 
 from .conftest import ignore_progress, tiny_config
 
-pytestmark = pytest.mark.usefixtures("drawn_once")
-
 
 def same_weights(first, second):
     a, b = first.graph.state_dict(), second.graph.state_dict()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -130,6 +130,31 @@ class PoseDataset:
             distortion=self.lens.distortion,
             coefficients=self.lens.coefficients,
         )
+
+
+# Bytes of images that ``remembered`` keeps.
+_MOST = 512 * 2**20
+
+
+def remembered(dataset: PoseDataset) -> PoseDataset:
+    """Return the data set with its first images kept in memory once they have been read.
+
+    Publishing reads frames several times: as they are, with harmless changes and with noise.
+    """
+    kept: dict[int, NDArray[np.uint8]] = {}
+    left = _MOST
+
+    def read_image(index: int) -> NDArray[np.uint8]:
+        nonlocal left
+        if index in kept:
+            return kept[index].copy()
+        image = dataset.read_image(index)
+        if image.nbytes <= left:
+            left -= image.nbytes
+            kept[index] = image.copy()
+        return image
+
+    return replace(dataset, read_image=read_image)
 
 
 def skipped_text(skipped: Mapping[str, int]) -> str:
