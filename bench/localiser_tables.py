@@ -223,17 +223,19 @@ def redraws() -> str:
             report = read_result(FOLDER, path.stem)
             for rule in (rule for rule in get_args(Rule) if rule in report):
                 for scope, figures in report[rule].items():
-                    width = figures["mean_width"]
+                    width, over = figures["mean_width"], figures.get("over_pooled")
                     rows.append(
                         [
                             *(report["bundle"], rule, scope),
                             f"{np.mean(figures['coverage']):.3f}",
                             f"{figures['joint_coverage']:.3f}",
                             _pose(np.mean(width[:3]), np.rad2deg(np.mean(width[3:]))),
+                            "-" if over is None else f"{over:.2f} x",
                             f"{figures['normalised_interval_score']:.3f}",
                         ]
                     )
-    head = ["bundle", "rule", "scope", "coverage per DoF", "all six", "mean width", "score"]
+    head = ["bundle", "rule", "scope", "coverage per DoF", "all six", "mean width"]
+    head += ["median width over pooled", "score"]
     return table(head, rows)
 
 
