@@ -27,8 +27,11 @@ Change = Callable[[Image8, np.random.Generator], Image8]
 # Training frames behind the statistics, and copies of them.
 _FRAMES, _HARMLESS, _NOISY = 1200, 150, 600
 _CHECKED = 16
-# A distance to the nearest frame is the root of a difference of large numbers.
-_TOLERANCE = 1e-2
+# The distance to the nearest frame, the first, is the root of a difference of large numbers.
+_TOLERANCES = {
+    NOVELTY_OUTPUT: np.array([1e-2, 1e-3, 1e-3, 1e-3]),
+    DEGRADATION_OUTPUT: np.array([1e-3]),
+}
 
 
 def familiarised(
@@ -111,8 +114,8 @@ def _check(after: Session, before: Session, feeds: list[Feed], fitted: Familiari
         ):
             off = np.abs(found[name] - expected) / np.maximum(1.0, np.abs(expected))
             # Written so that NaN is a disagreement.
-            if not off.max() <= _TOLERANCE:
+            if not (off <= _TOLERANCES[name]).all():
                 raise GateError(
                     f"export: expected output {name} of the graph to agree with its formula within "
-                    f"{_TOLERANCE:g}, found a difference of {off.max():.3g}"
+                    f"{np.min(_TOLERANCES[name]):g}, found a difference of {off.max():.3g}"
                 )
