@@ -3,15 +3,18 @@
     python bench/vigilance_cost.py BUNDLE FRAMES... [--json FILE]
 
 The frame without has the same network less the nodes that only the statistics of familiarity need,
-and no stream checks. Both take turns on the same images, on one thread and on two. ``stream`` is
-the time of the checks alone, after the network. The file's growth is that of the model.
+no factor of difficulty, and no stream checks. Both take turns on the same images, on one thread and
+on two: give over 256, so that none is repeated. ``stream`` is the time of the checks after the
+network, alone. The file's growth is that of the model.
 """
 
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from time import perf_counter
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -24,8 +27,10 @@ from rounds import figures, interleaved, ratio
 
 from cvo_edge.bundle.format import FAMILIARITY
 from cvo_edge.engine.loading import Bundle, read_bundle
+from cvo_edge.input import frame_checks
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.frame_checks import StreamChecks
+from cvo_edge.input.repetition import Digest
 from cvo_edge.monitor.watch import StreamWatch
 from cvo_edge.odometer import Odometer
 from cvo_export.bundles.draft import model_spec
@@ -38,6 +43,10 @@ class _NoChecks(StreamChecks):
 
     def doubts(self, *_: Any, **__: Any) -> tuple[()]:  # noqa: ANN401 - takes what the others take
         return ()
+
+
+# Instead of the digest of an image, which only these checks need.
+_NO_DIGEST = SimpleNamespace(of=lambda _: None)
 
 
 def without_alarm(bundle: Bundle) -> Bundle:
@@ -56,6 +65,7 @@ def without_alarm(bundle: Bundle) -> Bundle:
         calibration,
         model=spec,
         alarm=None,
+        difficulty=None,
         selftest=msgspec.structs.replace(calibration.selftest, outputs=outputs),
     )
     return Bundle.of(plain, model_bytes)
@@ -67,13 +77,16 @@ def frame_ms(bundle: Bundle, plain: Bundle, images: list[Any], threads: int) -> 
     bare._watch._checks = _NoChecks()  # noqa: SLF001 - no user wants this
     kept = np.empty_like(images[0])
     odometers = {"watched": watched, "bare": bare}
+
+    def ready(name: str, number: int) -> None:
+        np.copyto(kept, images[number % len(images)])
+        vars(frame_checks)["Digest"] = Digest if name == "watched" else _NO_DIGEST
+
     ms = interleaved(
         {name: lambda _, one=one: one.step(kept) for name, one in odometers.items()},
         rounds=ROUNDS,
         warmup=WARM_UP,
-        before={
-            name: lambda number: np.copyto(kept, images[number % len(images)]) for name in odometers
-        },
+        before={name: partial(ready, name) for name in odometers},
     )
     more = ms["watched"] - ms["bare"]
     return {

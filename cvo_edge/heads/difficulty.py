@@ -14,6 +14,7 @@ same as without it (Lei et al. 2018, section 5.2: locally weighted conformal inf
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -33,12 +34,19 @@ class Difficulty:
 
     def __init__(self, spec: DifficultySpec) -> None:
         self.spec = spec
-        self._weights = np.array(spec.weights)
 
     def factors(self, outputs: Mapping[str, NDArray[Any]]) -> Array:
         """Outputs stacked over n frames -> u (n,)."""
-        log_u = self.spec.bias + features(outputs) @ self._weights
-        return np.asarray(np.exp(np.clip(log_u, self.spec.lowest, self.spec.highest)))
+        return np.array([self._factor(row) for row in outputs[NOVELTY_OUTPUT].tolist()])
+
+    def _factor(self, novelty: list[float]) -> float:
+        """Return u of one frame; for four numbers plain Python is faster than numpy."""
+        spec = self.spec
+        log_u = spec.bias + sum(
+            weight * math.log(max(value, _LEAST_NOVELTY))
+            for weight, value in zip(spec.weights, novelty, strict=True)
+        )
+        return math.exp(max(spec.lowest, min(log_u, spec.highest)))
 
 
 def features(outputs: Mapping[str, NDArray[Any]]) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.estimate import Reason
-from cvo_edge.input.repetition import Repetition
+from cvo_edge.input.repetition import Digest, Repetition
 
 Image8 = NDArray[np.uint8]
 
@@ -30,14 +30,15 @@ _STALE_MS = 1000.0
 
 
 class Look:
-    """Image data kept until the next frame: the model's input and the original size.
+    """What the checks need of an image. Take it before inference empties the processor's caches.
 
-    ``tensor``: (1, height, width, 3) uint8 RGB; ``size``: (height, width) of the original image;
-    ``sample``: some pixels of the tensor, (n, 3).
+    From the model's input ``tensor``, (1, height, width, 3) uint8 RGB. ``size``: (height, width) of
+    the original image; ``sample``: some pixels of the tensor, (n, 3); ``digest``: what is compared
+    with other frames.
     """
 
     def __init__(self, tensor: Image8, size: tuple[int, int]) -> None:
-        self.tensor, self.size = tensor, size
+        self.size, self.digest = size, Digest.of(tensor)
         half = SAMPLE_STEP // 2
         self.sample: Image8 = tensor[0, half::SAMPLE_STEP, half::SAMPLE_STEP].reshape(-1, 3)
 
@@ -79,7 +80,7 @@ class StreamChecks:
         doubts: tuple[Reason, ...] = ()
         if look is not None:
             self.unproven += not fresh_noise
-            doubts += self._repetition.doubts(look.tensor, fresh_noise=fresh_noise, moving=moving)
+            doubts += self._repetition.doubts(look.digest, fresh_noise=fresh_noise, moving=moving)
         if stamp_ns is not None:
             if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
                 doubts += (Reason.STAMP_NOT_LATER,)

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import deque
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -61,6 +61,43 @@ _SAME = 0.02
 _SHORTEST_LOOP, _NEARER = 8, 0.6
 
 
+def _pairs(count: int) -> Numbers:
+    """Return the matrix (count / 2, count) of the means of two neighbours."""
+    return np.repeat(np.eye(count // 2, dtype=np.float32), 2, axis=1) / np.float32(2.0)
+
+
+# A product with cells from the left and the right gives the thumbnail less each row's mean, and as
+# the last column that mean.
+_PAIRS_OF_ROWS = _pairs(_ROWS * _CELLS)
+_WIDE = _pairs(_COLUMNS * _CELLS).T
+_MEAN = _WIDE.mean(axis=1, keepdims=True)
+_CENTRED_AND_MEAN = np.hstack([_WIDE - _MEAN, _MEAN])
+
+
+class Digest(NamedTuple):
+    """What is compared of a picture.
+
+    Attributes
+    ----------
+    hashes
+        (48,) uint64: a number for each block.
+    cells
+        (24, 32): mean grey levels.
+    thumbnail
+        (193,): values relative to the brightness of their row, and their squared length.
+    """
+
+    hashes: NDArray[np.uint64]
+    cells: Numbers
+    thumbnail: Numbers
+
+    @classmethod
+    def of(cls, tensor: Image8) -> Digest:
+        """Digest the model's input, (1, height, width, 3)."""
+        cells = _cells(tensor)
+        return cls(_block_hashes(tensor), cells, _thumbnail(cells))
+
+
 class Repetition:
     """Compares each picture with those before it; pass every picture once, in order."""
 
@@ -72,23 +109,21 @@ class Repetition:
         self._moving: deque[Numbers] = deque(maxlen=_IN_ORDER)
 
     def doubts(
-        self, tensor: Image8, *, fresh_noise: bool = True, moving: bool | None = None
+        self, digest: Digest, *, fresh_noise: bool = True, moving: bool | None = None
     ) -> tuple[Reason, ...]:
         """Compare a picture with earlier ones and store it.
 
         Parameters
         ----------
-        tensor
-            The model's input, (1, height, width, 3).
+        digest
+            Of the picture.
         fresh_noise
             Whether equal blocks are copies. Behind a codec that codes the difference to the
             previous frame, they mean that nothing moved.
         moving
             Whether the camera moves; None if that is unknown.
         """
-        cells = _cells(tensor)
-        thumbnail = _thumbnail(cells)
-        hashes = _block_hashes(tensor)
+        hashes, cells, thumbnail = digest
         repeated = fresh_noise and self._equal(hashes, cells)
         squares = self._squared_distances(thumbnail)
         looped = self._loops(squares, thumbnail) and moving is not False
@@ -98,43 +133,46 @@ class Repetition:
         return (Reason.FRAME_REPEATED,) * (repeated or looped) + (Reason.PICTURE_STILL,) * still
 
     def _equal(self, hashes: NDArray[np.uint64], cells: Numbers) -> bool:
-        equal = (self._hashes.rows == hashes).any(axis=0)
-        if not equal.any():
+        equal = self._hashes.rows == hashes
+        # The usual case, and the fastest of numpy's ways to find out.
+        if np.count_nonzero(equal) == 0:
             return False
         textured = _textured(cells)
-        found = int(np.count_nonzero(equal & textured))
+        found = int(np.count_nonzero(equal.any(axis=0) & textured))
         return found > 0 and found >= _EQUAL_SHARE * int(np.count_nonzero(textured))
 
     def _squared_distances(self, thumbnail: Numbers) -> Numbers:
         """Return the squared distance to each earlier thumbnail, the newest last."""
-        rows = self._thumbnails.rows
-        squares: Numbers = rows[:, -1] + thumbnail[-1] - 2.0 * (rows[:, :-1] @ thumbnail[:-1])
+        factors = np.float32(-2.0) * thumbnail
+        factors[-1] = 1.0
+        squares: Numbers = self._thumbnails.rows @ factors + thumbnail[-1]
         return squares
 
     def _loops(self, squares: Numbers, thumbnail: Numbers) -> bool:
         if len(squares) == 0 or not self._moved(thumbnail):
             return False
         self._moving.append(squares)
-        noise = _IN_ORDER * _STILL**2 * (thumbnail.size - 1)
         old = squares[: 1 - _SHORTEST_LOOP]
-        # A sum within the noise has no part beyond it.
-        if len(self._moving) < _IN_ORDER or len(old) == 0 or old.min() >= noise:
+        if len(self._moving) < _IN_ORDER or len(old) == 0:
+            return False
+        moved = sum(float(each[-1]) for each in self._moving)
+        near = min(_IN_ORDER * _STILL**2 * (thumbnail.size - 1), _NEAR**2 * moved)
+        # A sum below a limit has no part beyond it.
+        if old.min() >= near:
             return False
         # By lag, the newest frame last, which is a lag of 1. In a loop, the lag stays the same.
         by_lag = np.full((_IN_ORDER, FRAMES), np.inf, np.float32)
         for row, distances in zip(by_lag, self._moving, strict=True):
             row[-len(distances) :] = distances
         total = by_lag.sum(axis=0)
-        moved = float(total[-1])
         # From the second frame on that is compared with all of them: the first has none before it.
         oldest = int(np.isfinite(total).argmax()) + 1
         if oldest > FRAMES - _SHORTEST_LOOP:
             return False
         nearest = oldest + int(total[oldest : 1 - _SHORTEST_LOOP].argmin())
-        near = total[nearest] < min(noise, _NEAR**2 * moved)
         same = abs(total[nearest - 1] - moved) < _SAME * moved
         oscillates = total[1 - _SHORTEST_LOOP : -1].min() < _NEARER**2 * moved
-        return bool(near and same and not oscillates)
+        return bool(total[nearest] < near and same and not oscillates)
 
     def _moved(self, thumbnail: Numbers) -> bool:
         """Whether at least half of the picture changed since the previous frame."""
@@ -165,16 +203,19 @@ class _Newest:
 
 
 @cache
-def _factors(height: int, words: int) -> NDArray[np.uint64]:
-    """Return odd numbers, (height, words), that are the same in every process."""
-    generator = np.random.default_rng([height, words])
-    return generator.integers(2**64, size=(height, words), dtype=np.uint64) | np.uint64(1)
+def _factors(tall: int, words: int) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+    """Return odd numbers for the rows of a block, (tall,), and for words, (6, words)."""
+    generator = np.random.default_rng([tall, words])
+    rows = generator.integers(2**64, size=tall, dtype=np.uint64)
+    columns = generator.integers(2**64, size=(_ROWS, words), dtype=np.uint64)
+    return rows | np.uint64(1), columns | np.uint64(1)
 
 
 def _block_hashes(tensor: Image8) -> NDArray[np.uint64]:
     """Model input -> a number for each block, (48,): the sum of its words times random factors.
 
-    Blocks with other bytes have another number, but for a chance of about 2^-64. A word has eight
+    A factor for the row times one for the column. Blocks with other bytes have another number, but
+    for a chance of about 2^-64. A word has eight
     bytes, or one if the input is narrower than 22 pixels; what is beyond a whole number of words
     for each block is left out.
     """
@@ -182,9 +223,11 @@ def _block_hashes(tensor: Image8) -> NDArray[np.uint64]:
     word = np.dtype(np.uint64 if rows.shape[1] >= 8 * _COLUMNS else np.uint8)
     tall, long = len(rows) // _ROWS, rows.shape[1] // (_COLUMNS * word.itemsize)
     words = rows[: tall * _ROWS, : long * _COLUMNS * word.itemsize].view(word)
-    weighted: NDArray[np.uint64] = words * _factors(*words.shape)
-    columns = weighted.reshape(_ROWS, tall, -1).sum(axis=1)
-    return np.asarray(columns.reshape(_ROWS * _COLUMNS, long).sum(axis=1), np.uint64)
+    row_factors, column_factors = _factors(tall, words.shape[1])
+    # Rows first: no product is as large as the image.
+    blocks = words.reshape(_ROWS, tall, -1)
+    columns: NDArray[np.uint64] = np.einsum("brc,r->bc", blocks, row_factors) * column_factors
+    return np.asarray(columns.reshape(_ROWS * _COLUMNS, long).sum(axis=1))
 
 
 def _cells(tensor: Image8) -> Numbers:
@@ -195,14 +238,11 @@ def _cells(tensor: Image8) -> Numbers:
 
 
 def _thumbnail(cells: Numbers) -> Numbers:
-    """Cells -> 12 x 16 values relative to the brightness of their row, and their squared length."""
-    values = cv2.resize(cells, _THUMBNAIL[::-1], interpolation=cv2.INTER_AREA)
-    bright = values.sum(axis=1, keepdims=True) / np.float32(_THUMBNAIL[1])
-    values -= bright
-    values *= _LEVEL / (bright + _DARK)
-    thumbnail = np.empty(values.size + 1, np.float32)
-    thumbnail[:-1] = values.ravel()
-    thumbnail[-1] = thumbnail[:-1] @ thumbnail[:-1]
+    values = _PAIRS_OF_ROWS @ cells @ _CENTRED_AND_MEAN
+    thumbnail = np.empty(_THUMBNAIL[0] * _THUMBNAIL[1] + 1, np.float32)
+    relative = thumbnail[:-1]
+    np.multiply(values[:, :-1], _LEVEL / (values[:, -1:] + _DARK), out=relative.reshape(_THUMBNAIL))
+    thumbnail[-1] = relative @ relative
     return thumbnail
 
 

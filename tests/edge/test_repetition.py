@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from cvo_edge import Odometer, Reason, open_source
 from cvo_edge.input.preprocess import model_input
-from cvo_edge.input.repetition import FRAMES, Repetition, _block_hashes
+from cvo_edge.input.repetition import FRAMES, Digest, Repetition, _block_hashes
 from cvo_edge.programs.run import RunSummary
 
 HEIGHT, WIDTH = 192, 256
@@ -37,7 +37,7 @@ def at(x, deviation=2.0):
 
 def doubts(tensors, **told):
     checks = Repetition()
-    return [checks.doubts(tensor, **told) for tensor in tensors]
+    return [checks.doubts(Digest.of(tensor), **told) for tensor in tensors]
 
 
 @pytest.mark.parametrize("length", [1, 2, 9, FRAMES])
@@ -202,6 +202,8 @@ def test_real_recordings_are_not_accused_except_of_their_copies(real_data, folde
         if number == 50:
             break
         copied = before is not None and np.array_equal(frame.image, before)
-        found = checks.doubts(model_input(frame.image, HEIGHT, WIDTH, "none"), moving=True)
+        found = checks.doubts(
+            Digest.of(model_input(frame.image, HEIGHT, WIDTH, "none")), moving=True
+        )
         assert found == (REPEATED if copied else ())
         before = frame.image

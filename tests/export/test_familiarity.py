@@ -41,7 +41,7 @@ def test_distances_are_those_of_scipy():
             cdist(z[row, k, None], found.prototypes[k].astype(np.float64)).min()
             for k in range(_CELLS)
         ]
-        assert values[row, 0] == pytest.approx(max(nearest) / np.sqrt(_CHANNELS), abs=1e-6)
+        assert values[row, 0] == pytest.approx(max(nearest), abs=1e-6)
     rows = cells[:, 0].astype(np.float64)
     covariance = np.cov(rows, rowvar=False, bias=True)
     # Ledoit-Wolf's form, with a fixed share.

@@ -4,17 +4,17 @@ The features of a frame are a coarse grid of K cells with C channels each. Five 
 of the exported graph; ``novelty`` has four, ``degradation`` one:
 
 ``nearest``
-    Largest distance of a cell to the same cell of any training frame, of which 250 prototypes are
+    Largest distance of a cell to the same cell of any training frame, of which 128 prototypes are
     kept (k centres, Gonzalez 1985).
 ``cell``, ``mean``
-    Largest and mean Mahalanobis distance of a cell to a Gaussian of its own (PaDiM, Defard et al.
-    2021).
+    Mahalanobis distance of a cell to a Gaussian of its own (PaDiM, Defard et al. 2021): the largest
+    and the root mean square of all cells.
 ``colour``
     Mahalanobis distance of 18 colour numbers of some pixels, fitted with other exposures and
     other white balances.
 ``degradation``
-    Logit of a logistic regression that tells noisy copies from clean frames by the mean, largest,
-    smallest and standard deviation of each channel over the cells.
+    Logit of a logistic regression that tells noisy copies from clean frames by the mean and the
+    standard deviation of each channel over the cells.
 
 The metric of ``nearest`` is the covariance of what may change: differences between neighbouring
 training frames, and between frames and harmless copies of them. A generalised eigenproblem
@@ -37,7 +37,7 @@ Image8 = NDArray[np.uint8]
 # Names of the statistics in the order of ``novelty``, then ``degradation``.
 NOVELTY = ("nearest", "cell", "mean", "colour")
 
-PROTOTYPES, _TOP = 250, 48
+PROTOTYPES, _TOP = 128, 16
 # More channels are first reduced to their largest principal components.
 _CHANNELS = 128
 # Share of the mean variance that keeps covariances of few frames invertible.
@@ -64,13 +64,14 @@ class Familiarity:
     basis
         (raw channels, C), or None if there are few channels.
     mean, projection, precision
-        (K, C), (K, C, C) and (K, C): z = (f - mean) @ projection; 1 / lambda, over C.
+        (K, C), (K, C, C) and (K, C): z = (f - mean) @ projection, whitened and over sqrt(C), so
+        that sums of squares are means; 1 / lambda.
     prototypes
         (K, P, r): in the first r dimensions of z.
     weights, bias
-        (4 C,) and a number: the logistic regression on mean, largest, smallest and deviation.
+        (2 C,) and a number: the logistic regression on means and deviations.
     colour_mean, colour_whitening
-        (18,) and (18, 18).
+        (18,) and (18, 18): numbers - mean, times whitening, whose squares sum to their mean.
     """
 
     basis: Array | None
@@ -86,22 +87,21 @@ class Familiarity:
     def novelty(self, cells: NDArray[np.float32], pixels: NDArray[Any]) -> Array:
         """Cells (n, K, raw channels) and pixels (n, rows, columns, 3) RGB -> (n, 4)."""
         z = self.projected(cells)
-        deviation = np.sqrt(np.einsum("nkc,kc->nk", np.square(z), self.precision))
+        deviation = np.einsum("nkc,kc->nk", np.square(z), self.precision)
         top = self.prototypes.shape[2]
         prototypes = self.prototypes.astype(np.float64)
         squared = (
             np.square(prototypes).sum(axis=2)
             - 2.0 * np.einsum("nkr,kpr->nkp", z[..., :top], prototypes)
         ).min(axis=2) + np.square(z).sum(axis=2)
-        nearest = np.sqrt(np.maximum(squared, 0.0) / z.shape[2])
         whitened = (colour_numbers(pixels) - self.colour_mean) @ self.colour_whitening
-        columns = (
-            nearest.max(axis=1),
+        squares = (
+            squared.max(axis=1),
             deviation.max(axis=1),
             deviation.mean(axis=1),
-            np.sqrt(np.square(whitened).mean(axis=1)),
+            np.square(whitened).sum(axis=1),
         )
-        return np.asarray(np.minimum(np.stack(columns, axis=1), LARGEST_NOVELTY))
+        return np.asarray(np.sqrt(np.clip(np.stack(squares, axis=1), 0.0, LARGEST_NOVELTY**2)))
 
     def degradation(self, cells: NDArray[np.float32]) -> Array:
         """Cells (n, K, raw channels) -> (n, 1)."""
@@ -164,8 +164,8 @@ def fitted(
     projections, variances = zip(
         *(_diagonalised(known[:, k], changes[:, k]) for k in range(known.shape[1])), strict=True
     )
-    projection = np.array(projections).astype(np.float16)
     channels = known.shape[2]
+    projection = (np.array(projections) / np.sqrt(channels)).astype(np.float16)
     z = np.einsum("nkc,kcd->nkd", known - mean, projection.astype(np.float64))
     top = min(_TOP, channels)
     prototypes = np.stack([_centres(z[:, k, :top], PROTOTYPES) for k in range(z.shape[1])])
@@ -176,7 +176,7 @@ def fitted(
         basis=basis,
         mean=mean,
         projection=projection,
-        precision=1.0 / (channels * np.array(variances)),
+        precision=1.0 / np.array(variances),
         prototypes=prototypes.astype(np.float16),
         weights=weights,
         bias=bias,
@@ -225,9 +225,8 @@ def _centres(points: Array, count: int) -> Array:
 
 
 def summary(cells: Array) -> Array:
-    """Cells (n, K, C) -> each channel's mean, largest, smallest and deviation, (n, 4 C)."""
-    parts = (cells.mean(axis=1), cells.max(axis=1), cells.min(axis=1), cells.std(axis=1))
-    return np.concatenate(parts, axis=1)
+    """Cells (n, K, C) -> each channel's mean and standard deviation, (n, 2 C)."""
+    return np.concatenate([cells.mean(axis=1), cells.std(axis=1)], axis=1)
 
 
 def _logistic(clean: Array, noisy: Array) -> tuple[Array, float]:
@@ -276,6 +275,16 @@ def quarters(rows: int, columns: int) -> Array:
     return np.asarray(member / np.maximum(member.sum(axis=1, keepdims=True), 1))
 
 
+def in_rgb(weights: Array) -> Array:
+    """Weights (18, m) of ``colour_numbers`` -> weights (21, m) of means and covariances in RGB.
+
+    That is, of the means (4, 3) of the quarters and of all nine covariances (3, 3).
+    """
+    means, kept = weights[:12].reshape(4, 3, -1), weights[12:]
+    covariances = np.kron(OPPONENT, OPPONENT)[:, COVARIANCES] @ kept
+    return np.concatenate([(OPPONENT @ means).reshape(12, -1), covariances])
+
+
 def _recoloured(pixels: Image8, seed: int) -> NDArray[np.float64]:
     """Return copies of pixels (n, rows, columns, 3) under other exposures and white balances."""
     generator = np.random.default_rng(seed)
@@ -287,10 +296,11 @@ def _recoloured(pixels: Image8, seed: int) -> NDArray[np.float64]:
 
 
 def _whitening(rows: Array) -> Array:
-    """Return W with W W^T the inverse covariance of rows (n, C)."""
+    """Return W with W W^T the inverse covariance of rows (n, C), over C."""
     scale = rows.std(axis=0) + _LEAST
     scaled = (rows - rows.mean(axis=0)) / scale
     # Colour numbers have units of their own: the shrinkage works on correlations.
+    scale *= np.sqrt(rows.shape[1])
     return np.asarray(np.linalg.inv(np.linalg.cholesky(_shrunk(scaled))).T / scale[:, np.newaxis])
 
 

@@ -11,12 +11,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 from cvo_edge.bundle.format import DEGRADATION_OUTPUT, NOVELTY_OUTPUT
 from cvo_export.graph.familiarity import (
-    COVARIANCES,
     LARGEST_LOGIT,
     LARGEST_NOVELTY,
     NOVELTY,
-    OPPONENT,
     Familiarity,
+    in_rgb,
     quarters,
 )
 
@@ -88,71 +87,69 @@ class _Nodes:
         self.nodes.append(helper.make_node(kind, list(inputs), [output], label, **attributes))
         return output
 
-    def reduced(self, kind: str, value: str, *axes: int, keep: bool = False) -> str:
-        return self(kind, value, self.constant(np.array(axes, np.int64)), keepdims=int(keep))
+    def reduced(self, kind: str, value: str, axis: int, *, keep: bool = False) -> str:
+        return self(kind, value, self.constant(np.array([axis], np.int64)), keepdims=int(keep))
 
     def shaped(self, value: str, *shape: int) -> str:
         return self("Reshape", value, self.constant(np.array(shape, np.int64)))
 
 
+# A node takes microseconds whatever it computes: constants absorb factors and offsets, and one root
+# is taken of all squares.
 def _novelty(nodes: _Nodes, features: str, fitted: Familiarity, pixels: list[int]) -> None:
-    centred = nodes("Sub", features, nodes.constant(fitted.mean[np.newaxis]))
     cells, channels = fitted.mean.shape
+    centred = nodes("Sub", features, nodes.constant(fitted.mean[np.newaxis]))
     z = nodes("MatMul", nodes.shaped(centred, cells, 1, channels), nodes.half(fitted.projection))
-    squared = nodes("Mul", z, z)
-    variance = nodes("MatMul", squared, nodes.constant(fitted.precision[:, :, np.newaxis]))
-    deviation = nodes.shaped(nodes("Sqrt", variance), 1, cells)
+    squares = nodes("Mul", z, z)
+    deviations = nodes("MatMul", squares, nodes.constant(fitted.precision[:, :, np.newaxis]))
     top = fitted.prototypes.shape[2]
     first = nodes("Slice", z, *(nodes.constant(np.array([n], np.int64)) for n in (0, top, 2)))
     prototypes = fitted.prototypes.transpose(0, 2, 1)
     product = nodes("MatMul", first, nodes.half(np.ascontiguousarray(-2 * prototypes)))
     lengths = np.square(prototypes.astype(np.float64)).sum(axis=1, keepdims=True)
-    distance = nodes("Add", product, nodes.constant(lengths))
+    distances = nodes("Add", product, nodes.constant(lengths))
     nearest = nodes(
-        "Add", nodes.reduced("ReduceMin", distance, 2), nodes.reduced("ReduceSum", squared, 2)
+        "Add",
+        nodes.reduced("ReduceMin", distances, 2),
+        nodes.reduced("ReduceSum", squares, 2),
     )
-    mean = nodes("Div", nodes("Relu", nearest), nodes.constant(np.float32(channels)))
-    nearest = nodes.shaped(nodes("Sqrt", mean), 1, cells)
-    parts = [
-        nodes.reduced("ReduceMax", nearest, 1, keep=True),
-        nodes.reduced("ReduceMax", deviation, 1, keep=True),
-        nodes.reduced("ReduceMean", deviation, 1, keep=True),
+    deviations = nodes.shaped(deviations, cells, 1)
+    parts = (
+        nodes.reduced("ReduceMax", nearest, 0, keep=True),
+        nodes.reduced("ReduceMax", deviations, 0, keep=True),
+        nodes.reduced("ReduceMean", deviations, 0, keep=True),
         _colour(nodes, fitted, pixels),
-    ]
-    joined = nodes("Concat", *parts, axis=1)
-    nodes("Min", joined, nodes.constant(np.float32(LARGEST_NOVELTY)), name=NOVELTY_OUTPUT)
+    )
+    bounds = (nodes.constant(np.float32(bound)) for bound in (0.0, LARGEST_NOVELTY**2))
+    nodes("Sqrt", nodes("Clip", nodes("Concat", *parts, axis=1), *bounds), name=NOVELTY_OUTPUT)
 
 
 def _colour(nodes: _Nodes, fitted: Familiarity, pixels: list[int]) -> str:
     _, rows, columns, _ = pixels
     count = rows * columns
     values = nodes.shaped(nodes("Cast", PIXELS, to=TensorProto.FLOAT), count, 3)
-    colours = nodes("MatMul", values, nodes.constant(OPPONENT))
-    means = nodes("MatMul", nodes.constant(quarters(rows, columns)), colours)
-    centred = nodes("Sub", colours, nodes.reduced("ReduceMean", colours, 0, keep=True))
-    turned = nodes("Transpose", centred, perm=[1, 0])
-    moments = nodes.shaped(nodes("MatMul", turned, centred), 1, 9)
-    covariance = nodes("Div", moments, nodes.constant(np.float32(count)))
-    kept = nodes("Gather", covariance, nodes.constant(np.array(COVARIANCES, np.int64)), axis=1)
-    numbers = nodes("Concat", nodes.shaped(means, 1, 12), kept, axis=1)
-    offset = nodes("Sub", numbers, nodes.constant(fitted.colour_mean[np.newaxis]))
-    white = nodes("MatMul", offset, nodes.constant(fitted.colour_whitening))
-    return nodes("Sqrt", nodes.reduced("ReduceMean", nodes("Mul", white, white), 1, keep=True))
+    means = nodes("MatMul", nodes.constant(quarters(rows, columns)), values)
+    centred = nodes("Sub", values, nodes.reduced("ReduceMean", values, 0, keep=True))
+    covariance = nodes("Gemm", centred, centred, transA=1, alpha=1.0 / count)
+    numbers = nodes("Concat", nodes.shaped(means, 1, 12), nodes.shaped(covariance, 1, 9), axis=1)
+    whitening = in_rgb(fitted.colour_whitening)
+    offset = -fitted.colour_mean @ fitted.colour_whitening
+    white = nodes("Gemm", numbers, nodes.constant(whitening), nodes.constant(offset))
+    return nodes.reduced("ReduceSumSquare", white, 1, keep=True)
 
 
 def _degradation(nodes: _Nodes, features: str, fitted: Familiarity) -> None:
-    mean = nodes.reduced("ReduceMean", features, 1, keep=True)
-    centred = nodes("Sub", features, mean)
-    variance = nodes.reduced("ReduceMean", nodes("Mul", centred, centred), 1)
-    channels = fitted.mean.shape[1]
-    parts = (
-        nodes.shaped(mean, 1, channels),
-        nodes.reduced("ReduceMax", features, 1),
-        nodes.reduced("ReduceMin", features, 1),
-        nodes("Sqrt", variance),
+    cells, channels = fitted.mean.shape
+    mean = nodes.reduced("ReduceMean", features, 1)
+    deviations = nodes.reduced("ReduceL2", nodes("Sub", features, mean), 1)
+    weights = fitted.weights.copy()
+    # A deviation is the length of the differences over the root of their number.
+    weights[channels:] /= np.sqrt(cells)
+    logit = nodes(
+        "Gemm",
+        nodes("Concat", mean, deviations, axis=1),
+        nodes.constant(weights[:, np.newaxis]),
+        nodes.constant(np.array([fitted.bias])),
     )
-    summary = nodes("Concat", *parts, axis=1)
-    weighted = nodes("MatMul", summary, nodes.constant(fitted.weights[:, np.newaxis]))
-    logit = nodes("Add", weighted, nodes.constant(np.float32(fitted.bias)))
     bounds = (nodes.constant(np.float32(sign * LARGEST_LOGIT)) for sign in (-1.0, 1.0))
     nodes("Clip", logit, *bounds, name=DEGRADATION_OUTPUT)
