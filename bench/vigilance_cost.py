@@ -102,7 +102,7 @@ def stream_ms(bundle: Bundle, images: list[Any]) -> float:
     with Odometer(bundle, threads=1) as odometer:
         observations = [odometer.observe(image, 0) for image in images]
         observer = odometer._observer  # noqa: SLF001 - to time a part alone
-        watch, spent = StreamWatch(observer, bundle.calibration.alarm), []
+        watch, spent = StreamWatch(observer, bundle.calibration), []
         for number in range(WARM_UP + ROUNDS):
             observation = observations[number % len(images)]
             begin = perf_counter()

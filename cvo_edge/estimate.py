@@ -66,8 +66,9 @@ class Drift(NamedTuple):
     """Whether the images of a stream are still like those of the calibration.
 
     ``state``: ``unknown`` if the bundle cannot tell. ``reason`` and ``since``: why, and the number
-    of the first frame, during an alarm. ``false_alarms``: bound of the probability of a false
-    alarm, of a frame or a recording as the bundle states it; None if unknown.
+    of the first frame, during an alarm. ``false_alarms``: proven bound of the probability that a
+    known frame is beyond the limits, or that a new recording raises an alarm, as ``inspect`` says;
+    None if nothing is proven.
     """
 
     state: Literal["clear", "alarm", "unknown"]
@@ -340,8 +341,8 @@ def _recorded_drift(
 
 
 def recorded_novelty(novelty: float | None) -> float | None:
-    """Return the novelty as a record gives it: four digits, None if it is not a finite number."""
-    return None if novelty is None or not math.isfinite(novelty) else round(novelty, 4)
+    """Return the novelty as a record gives it: four digits, None for a frame not judged."""
+    return None if novelty is None else round(novelty, 4)
 
 
 def _null_infinite(values: Iterable[float]) -> tuple[Any, ...]:

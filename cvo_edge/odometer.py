@@ -114,7 +114,7 @@ class Odometer(Labelled):
         )
         self.chart = self._observer.chart
         self.origin_m = self._observer.origin_m
-        self._watch = StreamWatch(self._observer, calibration.alarm)
+        self._watch = StreamWatch(self._observer, calibration)
         if adapt or state is not None:
             self._adaptation = Adaptation(self.head, self.chart, calibration, self.threshold, state)
         self._clock = SYSTEM_CLOCK
@@ -273,7 +273,7 @@ class Odometer(Labelled):
                 f"stream: expected frames or a source, found the path {os.fsdecode(frames)}; use "
                 "odometer.stream(open_source(path))"
             )
-        self._watch = StreamWatch(self._observer, self.calibration.alarm)
+        self._watch = StreamWatch(self._observer, self.calibration)
         with closing(
             run_stream(
                 frames, self.mode, self._workers, self._process, lambda: self._seq, self._clock

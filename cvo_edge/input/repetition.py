@@ -157,27 +157,36 @@ class Repetition:
             return False
         moved = sum(float(each[-1]) for each in self._moving)
         near = min(_IN_ORDER * _STILL**2 * (thumbnail.size - 1), _NEAR**2 * moved)
-        # A sum below a limit has no part beyond it.
-        if old.min() >= near:
-            return False
-        # By lag, the newest frame last, which is a lag of 1. In a loop, the lag stays the same.
+        # A sum below a limit has no part beyond it: usually, this is the end.
+        return bool(old.min() < near) and _is_loop(self._by_lag().sum(axis=0), moved, near)
+
+    def _by_lag(self) -> Numbers:
+        """Return the distances of the moving frames, (8, 256), infinite where nothing was before.
+
+        Each row is of one frame, its last column of the frame before that one: a lag of 1. In a
+        loop, the lag stays the same from row to row.
+        """
         by_lag = np.full((_IN_ORDER, FRAMES), np.inf, np.float32)
         for row, distances in zip(by_lag, self._moving, strict=True):
             row[-len(distances) :] = distances
-        total = by_lag.sum(axis=0)
-        # From the second frame on that is compared with all of them: the first has none before it.
-        oldest = int(np.isfinite(total).argmax()) + 1
-        if oldest > FRAMES - _SHORTEST_LOOP:
-            return False
-        nearest = oldest + int(total[oldest : 1 - _SHORTEST_LOOP].argmin())
-        same = abs(total[nearest - 1] - moved) < _SAME * moved
-        oscillates = total[1 - _SHORTEST_LOOP : -1].min() < _NEARER**2 * moved
-        return bool(total[nearest] < near and same and not oscillates)
+        return by_lag
 
     def _moved(self, thumbnail: Numbers) -> bool:
         """Whether at least half of the picture changed since the previous frame."""
         change = np.abs(thumbnail[:-1] - self._thumbnails.rows[-1, :-1])
         return bool(2 * np.count_nonzero(change > _CHANGED) >= change.size)
+
+
+def _is_loop(total: Numbers, moved: float, near: float) -> bool:
+    """Whether sums of distances by lag, (256,), show a loop; ``moved`` is that of the lag 1."""
+    # From the second frame on that is compared with all of them: the first has none before it.
+    oldest = int(np.isfinite(total).argmax()) + 1
+    if oldest > FRAMES - _SHORTEST_LOOP:
+        return False
+    nearest = oldest + int(total[oldest : 1 - _SHORTEST_LOOP].argmin())
+    same_place = abs(total[nearest - 1] - moved) < _SAME * moved
+    oscillates = total[1 - _SHORTEST_LOOP : -1].min() < _NEARER**2 * moved
+    return bool(total[nearest] < near and same_place and not oscillates)
 
 
 class _Newest:

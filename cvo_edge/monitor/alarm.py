@@ -4,13 +4,15 @@ A bundle's graph gives five statistics x of every frame (outputs ``novelty`` and
 and the bundle their usual values, scales and limits: r = (x - usual) / scale.
 
 ``frames``: a frame is beyond if any r exceeds the limit, a conformal quantile of known frames'
-largest r; a new frame of the same recordings is beyond with the stated probability at most. A
-doubt lasts while more than a quarter of the last 32 frames were beyond.
+largest r. A frame exchangeable with those is beyond with probability at most 1 %; frames of a block
+are not, because neighbours depend on each other. A doubt lasts while at least a quarter of the last
+32 frames, and at least three, were beyond.
 
 ``recordings``: a running statistic M_t = max(0.9 E_t(1/2), E_t(1/10)) of each r must not exceed the
-limit; E_t(a) is the exponentially weighted mean of weight a. Each limit is the largest M_t of all G
-calibrated recordings, so a new recording that is no longer than those raises an alarm at any time
-with probability at most k / (G + 1), with k = 5 statistics: a union of k rank statements.
+limit; E_t(a) is the exponentially weighted mean of weight a. Each limit is at least the largest M_t
+of all G calibration recordings. A new recording that is exchangeable with them, length included,
+therefore exceeds it with probability at most 1 / (G + 1), and any of the k = 5 limits with k / (G +
+1), at any time. In a crossed calibration other networks gave the limits, and nothing is proven.
 """
 
 from __future__ import annotations
@@ -22,7 +24,13 @@ from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import DEGRADATION_OUTPUT, NOVELTY_OUTPUT, STATISTICS, AlarmSpec
+from cvo_edge.bundle.format import (
+    DEGRADATION_OUTPUT,
+    NOVELTY_OUTPUT,
+    STATISTICS,
+    AlarmSpec,
+    Calibration,
+)
 from cvo_edge.estimate import Drift, Reason
 
 # Share of known frames beyond the limit of single frames.
@@ -42,7 +50,7 @@ class Judgement(NamedTuple):
 
 
 class Running:
-    """The running statistics of one stream: the means of each value, (k,)."""
+    """The running statistics of one stream: exponentially weighted means, one row per weight."""
 
     def __init__(self, limits: tuple[float, ...]) -> None:
         self._most = tuple(_LARGEST * limit for limit in limits)
@@ -69,18 +77,19 @@ class Running:
 class StreamAlarm:
     """Judges the frames of one stream; pass every usable frame once, in order.
 
-    ``spec`` is None for a bundle without an alarm, whose drift is unknown.
+    ``spec`` is None for a bundle without an alarm, whose drift is unknown. ``bound`` is that of
+    ``false_alarms``.
     """
 
-    def __init__(self, spec: AlarmSpec | None) -> None:
-        self._spec = spec
+    def __init__(self, spec: AlarmSpec | None, bound: float | None = None) -> None:
+        self._spec, self._bound = spec, bound
         self._running = None if spec is None else Running(spec.limits)
         self._recent: deque[bool] = deque(maxlen=_REMEMBERED)
         self._since: int | None = None
         self._reason: Reason | None = None
 
     def judge(self, outputs: Mapping[str, NDArray[Any]], seq: int) -> Judgement | None:
-        """Judge frame ``seq`` by the model's outputs; None without an alarm."""
+        """Judge frame ``seq`` by the model's outputs, all finite; None without an alarm."""
         spec = self._spec
         if spec is None or self._running is None:
             return None
@@ -88,16 +97,15 @@ class StreamAlarm:
         if spec.kind == "recordings":
             values = self._running.add(values)
         shares = [value / limit for value, limit in zip(values, spec.limits, strict=True)]
-        # Written so that NaN is beyond.
-        largest = max(shares) if all(map(math.isfinite, shares)) else math.inf
-        beyond = not largest <= 1.0
+        largest = max(shares)
+        beyond = largest > 1.0
         lasting = False
         if spec.kind == "frames":
             self._recent.append(beyond)
             count = sum(self._recent)
             lasting = count >= max(_LEAST, _SHARE * len(self._recent))
         if beyond:
-            degraded = largest in shares and shares.index(largest) == len(shares) - 1
+            degraded = shares.index(largest) == len(shares) - 1
             self._reason = Reason.IMAGE_DEGRADED if degraded else Reason.IMAGE_UNFAMILIAR
         if not (beyond or lasting):
             self._reason = self._since = None
@@ -107,11 +115,11 @@ class StreamAlarm:
 
     @property
     def drift(self) -> Drift:
-        """What the stream has come to."""
+        """The state after the last frame that was judged."""
         if self._spec is None:
             return Drift("unknown")
         state: Literal["clear", "alarm"] = "clear" if self._reason is None else "alarm"
-        return Drift(state, self._reason, self._since, false_alarms(self._spec))
+        return Drift(state, self._reason, self._since, self._bound)
 
 
 def values_of(outputs: Mapping[str, NDArray[Any]], spec: AlarmSpec) -> list[float]:
@@ -131,28 +139,35 @@ def rank(n: int) -> int:
     return min(math.ceil(LEVEL * (n + 1)), n)
 
 
-def false_alarms(spec: AlarmSpec) -> float:
-    """Return the bound of the probability of a false alarm; 1 if nothing is bounded."""
+def false_alarms(calibration: Calibration) -> float | None:
+    """Return the bound of the probability of a false alarm; None if none is proven."""
+    spec, source = calibration.alarm, calibration.calibration
+    if spec is None or source.crossed is not None or source.split.kind == "block":
+        return None
     if spec.kind == "frames":
         return 1.0 - rank(spec.n) / (spec.n + 1)
-    return min(1.0, len(STATISTICS) / (spec.n + 1))
+    bound = len(STATISTICS) / (spec.n + 1)
+    return bound if bound < 1.0 else None
 
 
-def alarm_statement(spec: AlarmSpec | None) -> str:
+def alarm_statement(calibration: Calibration) -> str:
     """Return in a sentence what is known of the alarm's false alarms."""
+    spec, source = calibration.alarm, calibration.calibration
     if spec is None:
         return "none: the graph has no outputs novelty and degradation; drift is unknown"
-    bound = false_alarms(spec)
+    bound = false_alarms(calibration)
+    if source.crossed is not None:
+        return "no rate of false alarms is proven: other networks gave the limits"
+    if bound is None and spec.kind == "frames":
+        return "no rate of false alarms is proven: neighbouring frames depend on each other"
+    if bound is None:
+        return f"{spec.n} recordings bound no rate of false alarms; {len(STATISTICS)} or more would"
     if spec.kind == "frames":
         return (
             f"a new frame of the calibrated recordings is beyond the limits with probability at "
             f"most {bound:.2g}, from {spec.n} frames"
         )
-    if bound >= 1.0:
-        return (
-            f"{spec.n} recordings bound no rate of false alarms; more than {len(STATISTICS)} would"
-        )
     return (
-        f"a new recording, no longer than the {spec.n} calibrated ones, has a false alarm with "
-        f"probability at most {bound:.2g}"
+        f"a new recording, exchangeable with the {spec.n} of the calibration, length included, has "
+        f"a false alarm with probability at most {bound:.2g}"
     )

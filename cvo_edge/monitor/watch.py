@@ -1,16 +1,16 @@
-"""All checks of one stream, in the order in which they speak."""
+"""All checks of one stream, in the order of their reasons in a record."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from cvo_edge.bundle.format import AlarmSpec
+from cvo_edge.bundle.format import Calibration
 from cvo_edge.camera_check import LensEstimate
 from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.estimate import Drift, Reason
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.frame_checks import StreamChecks
-from cvo_edge.monitor.alarm import StreamAlarm
+from cvo_edge.monitor.alarm import StreamAlarm, false_alarms
 
 
 class Verdict(NamedTuple):
@@ -21,6 +21,11 @@ class Verdict(NamedTuple):
     novelty: float | None
 
 
+def tells_of_the_place(observation: Observation) -> bool:
+    """Whether the alarm judges a frame: not if another check of the image explains it."""
+    return observation.fault is None and observation.doubt in (None, Reason.IMAGE_UNFAMILIAR)
+
+
 class StreamWatch:
     """Watches one stream; pass every frame once, in order.
 
@@ -28,15 +33,15 @@ class StreamWatch:
     ----------
     observer
         The observer of the stream's frames.
-    alarm
-        The limits of the bundle's alarm, or None.
+    calibration
+        That of its bundle.
     """
 
-    def __init__(self, observer: Observer, alarm: AlarmSpec | None) -> None:
+    def __init__(self, observer: Observer, calibration: Calibration) -> None:
         self._checks = StreamChecks()
         self._sizes = observer.stream_sizes()
         self._camera = observer.camera_check()
-        self._alarm = StreamAlarm(alarm)
+        self._alarm = StreamAlarm(calibration.alarm, false_alarms(calibration))
 
     def judge(self, observation: Observation, seq: int, frame: Frame, age_ms: float) -> Verdict:
         """Judge a frame by its own doubts and by the stream; ``age_ms`` is the frame's age."""
@@ -49,8 +54,7 @@ class StreamWatch:
         if self._camera_differs(observation, doubts):
             doubts += (Reason.CAMERA_DIFFERS,)
         judged = None
-        # What another check of the image explains says nothing of the place.
-        if observation.fault is None and observation.doubt in (None, Reason.IMAGE_UNFAMILIAR):
+        if tells_of_the_place(observation):
             judged = self._alarm.judge(observation.outputs, seq)
         if judged is None:
             return Verdict(doubts, self.drift, None)

@@ -59,7 +59,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         *_crossed(source),
         *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
         *([] if calibration.images is None else _entry("images", _images(calibration.images))),
-        *_entry("alarm", alarm_statement(calibration.alarm)),
+        *_entry("alarm", alarm_statement(calibration)),
         *([] if scale is None else _entry("difficulty", _difficulty(scale))),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
         *_entry("self-test", _selftest(calibration.selftest)),

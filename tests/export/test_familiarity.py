@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist, mahalanobis
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
-from cvo_edge.monitor.alarm import StreamAlarm
+from cvo_edge.monitor.alarm import Running, StreamAlarm
 from cvo_export.bundles.alarm import Statistics, fitted_alarm
 from cvo_export.data.harmless import HARMLESS
 from cvo_export.graph import familiarise
@@ -129,7 +129,18 @@ def test_neighbours_follow_each_other_in_one_recording():
     assert np.mean(np.diff(kept) == 1) >= 0.5
 
 
-def test_a_bundle_of_single_frames_flags_at_most_its_share(tiny_bundle):
+def test_new_frames_are_beyond_the_limits_as_rarely_as_stated():
+    generator = np.random.default_rng(3)
+    sequence = np.zeros(400, np.int64)
+    frames = [Statistics(generator.standard_t(4, (400, 5)), sequence) for _ in range(4)]
+    spec = fitted_alarm("random", (frames[0], frames[1]), (frames[2], frames[2]))
+    new = (generator.standard_t(4, (20_000, 5)) - np.array(spec.usual)) / np.array(spec.scales)
+    share = np.mean(new.max(axis=1) > spec.limits[0])
+    # 400 draws set the limit: its own level has a deviation of half a percent.
+    assert abs(share - 0.01) < 3.0 * 0.005
+
+
+def test_a_split_into_frames_limits_frames(tiny_bundle):
     alarm = read_calibration(tiny_bundle).alarm
     assert alarm is not None
     assert alarm.kind == "frames"
@@ -146,26 +157,49 @@ def test_harmless_changes_change_little_and_something(change):
     assert 0.0 < difference.mean() < 25.0
 
 
-def test_limits_of_recordings_are_their_largest_running_values():
-    generator = np.random.default_rng(0)
+def _recordings(seed=0):
+    generator = np.random.default_rng(seed)
     sequence = np.repeat(np.arange(6), 30)
-    both = [Statistics(generator.normal(size=(180, 5)), sequence) for _ in range(4)]
-    spec = fitted_alarm("sequence", (both[0], both[1]), (both[2], both[3]))
+    val, changed_val, cal, changed_cal = (
+        Statistics(generator.normal(size=(180, 5)), sequence) for _ in range(4)
+    )
+    return (val, changed_val), (cal, changed_cal)
+
+
+def test_limits_of_recordings_are_their_largest_running_values():
+    val, cal = _recordings()
+    spec = fitted_alarm("sequence", val, cal)
     assert (spec.kind, spec.n) == ("recordings", 6)
-    assert spec.recordings is not None
-    for number, mean in enumerate(spec.recordings):
+    largest = np.zeros(5)
+    for each in cal:
+        for number in range(6):
+            running = Running((np.inf,) * 5)
+            rows = (each.values[each.sequence == number] - spec.usual) / spec.scales
+            found = np.array([running.add(row) for row in rows.tolist()])
+            largest = np.maximum(largest, found.max(axis=0))
+    assert spec.limits == pytest.approx(largest)
+
+
+def test_novelties_of_recordings_are_those_of_new_ones():
+    val, cal = _recordings()
+    recordings = fitted_alarm("sequence", val, cal).recordings
+    assert recordings is not None
+    for number, mean in enumerate(recordings):
         # What the records of a new recording would give, of a bundle that never saw it.
         own, others = (
-            [Statistics(each.values[rows], each.sequence[rows]) for each in both[2:]]
-            for rows in (sequence == number, sequence != number)
+            tuple(Statistics(each.values[rows], each.sequence[rows]) for each in cal)
+            for rows in (cal[0].sequence == number, cal[0].sequence != number)
         )
-        alarm = StreamAlarm(fitted_alarm("sequence", (both[0], both[1]), (others[0], others[1])))
+        alarm = StreamAlarm(fitted_alarm("sequence", val, others))
         outputs = ({"novelty": row[:4], "degradation": row[4:]} for row in own[0].values)
         novelties = [alarm.judge(each, seq).novelty for seq, each in enumerate(outputs)]
         assert mean == pytest.approx(np.mean(novelties), abs=1e-4)
-    one = fitted_alarm("sequence", (both[0], both[1]), (own[0], own[1]))
-    assert one.recordings is None
-    single = fitted_alarm("random", (both[0], both[1]), (both[2], both[3]))
-    r = (both[2].values - np.array(single.usual)) / np.array(single.scales)
-    assert (single.kind, single.recordings) == ("frames", None)
-    assert np.mean(r.max(axis=1) > single.limits[0]) <= 0.01
+        assert fitted_alarm("sequence", val, own).recordings is None
+
+
+def test_limits_of_frames_are_beyond_all_but_a_hundredth():
+    val, cal = _recordings()
+    spec = fitted_alarm("random", val, cal)
+    r = (cal[0].values - np.array(spec.usual)) / np.array(spec.scales)
+    assert (spec.kind, spec.recordings) == ("frames", None)
+    assert np.mean(r.max(axis=1) > spec.limits[0]) <= 0.01

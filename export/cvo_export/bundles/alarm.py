@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import (
     DEGRADATION_OUTPUT,
-    FAMILIARITY,
     NOVELTY_OUTPUT,
     STATISTICS,
     AlarmSpec,
     Five,
     SplitSpec,
 )
+from cvo_edge.errors import UsageError
 from cvo_edge.estimate import recorded_novelty
 from cvo_edge.monitor.alarm import Running, StreamAlarm, rank
 from cvo_edge.monitor.martingale import mean_novelty
@@ -46,11 +46,6 @@ class Statistics(NamedTuple):
 
 # Of frames as they are, and of copies with harmless changes.
 Pair = tuple[Statistics, Statistics]
-
-
-def tells(seen: Observed) -> bool:
-    """Whether a graph has the statistics."""
-    return seen.outputs.keys() >= FAMILIARITY.keys()
 
 
 def with_copies(
@@ -87,8 +82,9 @@ def together(pairs: Sequence[Pair]) -> Pair:
 
 
 def _statistics(seen: Observed) -> Statistics:
-    columns = seen.outputs[NOVELTY_OUTPUT], seen.outputs[DEGRADATION_OUTPUT]
-    return Statistics(np.concatenate(columns, axis=1).astype(np.float64), seen.sequence)
+    if seen.judged is None:
+        raise UsageError("alarm: expected a graph with the statistics of familiarity, found none")
+    return Statistics(seen.judged.values, seen.judged.sequence)
 
 
 def fitted_alarm(
@@ -166,7 +162,7 @@ def _novelties(spec: AlarmSpec, largest: Array, known: Statistics) -> tuple[floa
             alarm.judge({NOVELTY_OUTPUT: row[:-1], DEGRADATION_OUTPUT: row[-1:]}, seq)
             for seq, row in enumerate(known.values[known.sequence == number])
         )
-        _, mean = mean_novelty(each and recorded_novelty(each.novelty) for each in judged)
+        _, mean = mean_novelty(recorded_novelty(each.novelty) for each in judged if each)
         if mean is not None:
             means.append(mean)
     return tuple(means)

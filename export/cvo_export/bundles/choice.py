@@ -40,14 +40,14 @@ def chosen(draft: Draft, val: Observed, candidates: Sequence[Candidate]) -> Cand
 
 
 def with_difficulty(draft: Draft, candidate: Candidate, val: Observed, noisy: Observed) -> Draft:
-    """Return the draft with a difficulty, if val speaks for one.
+    """Return a draft that has no difficulty with one, if val speaks for it.
 
     It is fitted to val frames as they are and to noisy copies of val frames. At thresholds of the
     frames as they are, a tenth fewer of the noisy truths have to be missed, and neither kind's
     interval score may rise by more than 5 %. If there are enough val frames, each half of them
     decides on a difficulty of the other one.
     """
-    plain = replace(draft, difficulty=None).head(candidate)
+    plain = draft.head(candidate)
 
     def fitted(clean: Observed, copies: Observed) -> Draft:
         entry = _threshold(plain, clean)
@@ -66,7 +66,7 @@ def with_difficulty(draft: Draft, candidate: Candidate, val: Observed, noisy: Ob
         before += _judged(draft, plain, *decides)
         after += _judged(draft, fitted(*fits).head(candidate), *decides)
     most = np.array([1.0 + _PRICE, 1.0 + _PRICE, 1.0 - _GAIN])
-    return fitted(val, noisy) if (after <= most * before).all() else replace(draft, difficulty=None)
+    return fitted(val, noisy) if (after <= most * before).all() else draft
 
 
 def _judged(draft: Draft, head: Head, clean: Observed, noisy: Observed) -> Array:

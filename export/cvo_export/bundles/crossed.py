@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Calibration, DifficultySpec
 from cvo_edge.heads import Candidate
-from cvo_export.bundles.alarm import Pair, fitted_alarm, tells, together, with_copies
+from cvo_export.bundles.alarm import Pair, fitted_alarm, together, with_copies
 from cvo_export.bundles.choice import chosen, with_difficulty
 from cvo_export.bundles.difficulty import degraded
 from cvo_export.bundles.draft import Draft, images_of
@@ -78,12 +78,12 @@ def calibrated_crossed(
     images = images_of(draft.camera, val.size, [each.coloured for each in (val, *seen)])
     draft = replace(draft, images=images)
     if images.colour:
-        val, *seen = (each.where(each.coloured) for each in (val, *seen))
+        val, *seen = (each.in_colour() for each in (val, *seen))
     best = chosen(draft, val, candidates)
     number = [candidate is best for candidate in candidates].index(True)
     head = draft.head(best)
     alarm = None
-    if tells(val):
+    if val.judged is not None:
         with draft.observer(model_bytes, head) as observer:
             given = partial(observe, observer), dataset, draft.split
             known = with_copies(*given, val)

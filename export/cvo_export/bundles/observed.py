@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Threshold
+from cvo_edge.bundle.format import FAMILIARITY, Threshold
 from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.errors import SourceError
 from cvo_edge.heads import Head
 from cvo_edge.input.image_checks import has_colour
+from cvo_edge.monitor.watch import tells_of_the_place
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import about
 from cvo_edge.sets import ConformalSet
@@ -32,6 +33,17 @@ class Scored(NamedTuple):
     sequence: NDArray[np.int64]
 
 
+class Judged(NamedTuple):
+    """The m frames that the alarm judges: those that passed, and those only a solver doubts.
+
+    Statistics (m, 5), sequence numbers (m,), and which images have colour (m,).
+    """
+
+    values: Array
+    sequence: NDArray[np.int64]
+    coloured: NDArray[np.bool_]
+
+
 @dataclass(frozen=True)
 class Observed:
     """The runtime's results for the n frames that passed the frame checks, stacked.
@@ -40,7 +52,7 @@ class Observed:
     the bundle's chart; ``pose`` and ``true_pose`` are (n, 7); all positions are relative to the
     bundle's origin. ``sequence`` (n,) holds sequence numbers; ``coloured`` (n,) tells which images
     have colour; ``size`` is width and height of the first image; ``invalid`` and ``degraded``
-    count the frames that the checks excluded.
+    count the frames that the checks excluded. ``judged`` is None if the graph has no statistics.
     """
 
     indices: NDArray[np.int64]
@@ -54,9 +66,18 @@ class Observed:
     size: tuple[int, int]
     invalid: int
     degraded: int
+    judged: Judged | None
+
+    def in_colour(self) -> Observed:
+        """Return the frames whose images have colour; counts of excluded frames stay."""
+        judged = self.judged
+        if judged is not None:
+            rows = judged.coloured
+            judged = Judged(judged.values[rows], judged.sequence[rows], judged.coloured[rows])
+        return dataclasses.replace(self.where(self.coloured), judged=judged)
 
     def where(self, rows: NDArray[np.bool_]) -> Observed:
-        """Return the frames that a mask (n,) chooses; counts of excluded frames stay."""
+        """Return the frames that a mask (n,) chooses; counts, and what is judged, stay."""
         chosen = {
             name: getattr(self, name)[rows]
             for name in ("indices", "point", "truth", "pose", "true_pose", "sequence", "coloured")
@@ -92,6 +113,7 @@ def observe(
     """
     kept: list[int] = []
     seen: list[Observation] = []
+    judged: list[tuple[NDArray[np.float32], int, bool]] = []
     reasons: Counter[str] = Counter()
     invalid = degraded = 0
     for index in indices.tolist():
@@ -101,6 +123,9 @@ def observe(
             image = None  # flagged as invalid, as on the device
         observation = observer.observe(image, seq=index)
         problem = observation.fault or observation.doubt
+        if tells_of_the_place(observation) and observation.look is not None:
+            number = int(dataset.sequence[index])
+            judged.append((_statistics(observation), number, has_colour(observation.look)))
         if problem is None:
             kept.append(index)
             seen.append(observation)
@@ -132,7 +157,20 @@ def observe(
         size=(looks[0].size[1], looks[0].size[0]),
         invalid=invalid,
         degraded=degraded,
+        judged=_judged(judged),
     )
+
+
+def _statistics(observation: Observation) -> NDArray[np.float32]:
+    """Return the statistics (5,) of a frame, or none, (0,)."""
+    outputs = observation.outputs
+    found = [outputs[name][0] for name in FAMILIARITY if name in outputs]
+    return np.concatenate([np.zeros(0, np.float32), *found])
+
+
+def _judged(rows: list[tuple[NDArray[np.float32], int, bool]]) -> Judged | None:
+    values, sequence, coloured = (np.array(part) for part in zip(*rows, strict=True))
+    return Judged(values.astype(np.float64), sequence, coloured) if values.shape[1] else None
 
 
 def in_order(*observed: Observed) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:

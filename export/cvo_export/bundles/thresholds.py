@@ -31,7 +31,7 @@ from cvo_edge.errors import UsageError
 from cvo_edge.heads import Candidate, Head
 from cvo_edge.programs.selftest import observe_selftest
 from cvo_edge.vocabulary import SCOPES, Joint, Rule, Scope
-from cvo_export.bundles.alarm import fitted_alarm, tells, with_copies
+from cvo_export.bundles.alarm import fitted_alarm, with_copies
 from cvo_export.bundles.choice import chosen, with_difficulty
 from cvo_export.bundles.difficulty import degraded
 from cvo_export.bundles.draft import SELFTEST_SIZE, Counts, Draft, images_of
@@ -72,7 +72,7 @@ def calibrated(
     images = images_of(draft.camera, val.size, (val.coloured, cal.coloured))
     draft = dataclasses.replace(draft, images=images)
     if images.colour:
-        val, cal = val.where(val.coloured), cal.where(cal.coloured)
+        val, cal = val.in_colour(), cal.in_colour()
     known, sequence = in_order(val, cal)
     candidates = [
         candidate._replace(
@@ -88,7 +88,7 @@ def calibrated(
             val = observe(observer, dataset, roles["val"])
             cal = observe(observer, dataset, roles["cal"])
     alarm = None
-    if tells(val):
+    if val.judged is not None:
         with draft.observer(model_bytes, head) as observer:
             given = partial(observe, observer), dataset, draft.split
             copies = with_copies(*given, val), with_copies(*given, cal, whole=True)

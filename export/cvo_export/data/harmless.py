@@ -52,14 +52,16 @@ HARMLESS: tuple[Callable[[Image, np.random.Generator], Image], ...] = (
 
 
 def harmlessly_changed(dataset: PoseDataset, seed: int, unit: NDArray[np.int64]) -> PoseDataset:
-    """Return the data set with one harmless change a unit, seeded by (seed, frame number).
+    """Return the data set with one harmless change a unit, the kinds in turn.
 
-    ``unit`` (n,) says which frames change alike, such as those of one recording.
+    ``unit`` (n,) says which frames change alike, such as those of one recording: one exposure and
+    one white balance each, not a flicker, seeded by (seed, unit). Noise is seeded by (seed, frame
+    number).
     """
 
     def read_image(index: int) -> Image:
         change = HARMLESS[int(unit[index]) % len(HARMLESS)]
-        # One exposure and one white balance a unit, not a flicker.
-        return change(dataset.read_image(index), np.random.default_rng((seed, int(unit[index]))))
+        drawn_once = index if change is _grainy else int(unit[index])
+        return change(dataset.read_image(index), np.random.default_rng((seed, drawn_once)))
 
     return replace(dataset, read_image=read_image)

@@ -69,7 +69,7 @@ def familiarised(
     ordered = np.sort(training)
     known, cells, pixels = seen(ordered[spread_pairs(len(ordered), _FRAMES)], [_unchanged])
     copied, harmless, _ = seen(_spread(known, _HARMLESS), list(HARMLESS))
-    _, noisy, _ = seen(_spread(known, _NOISY), _noises(generator))
+    _, noisy, _ = seen(_spread(known, _NOISY), _NOISES)
     found = fitted(
         cells,
         neighbours(known, dataset.sequence),
@@ -88,34 +88,37 @@ def _unchanged(image: Image8, _: np.random.Generator) -> Image8:
     return image
 
 
-def _noises(generator: np.random.Generator) -> list[Change]:
-    """Return the study's kinds of noise in turn, each at several strengths."""
+def _with_noise(name: str) -> Change:
+    """Return the change to a noise of the study, at a strength drawn for each image."""
 
-    def at(name: str) -> Change:
-        def change(image: Image8, random: np.random.Generator) -> Image8:
-            return drawn(name, generator).degrade(image, random)
+    def change(image: Image8, generator: np.random.Generator) -> Image8:
+        return drawn(name, generator).degrade(image, generator)
 
-        return change
+    return change
 
-    return [at(name) for name in KINDS]
+
+_NOISES = [_with_noise(name) for name in KINDS]
 
 
 def _spread(indices: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     return indices[np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(np.int64)]
 
 
-def _check(after: Session, before: Session, feeds: list[Feed], fitted: Familiarity) -> None:
+def _check(after: Session, before: Session, feeds: list[Feed], found: Familiarity) -> None:
     """Raise GateError unless the graph gives what the formulas give."""
     for each in feeds:
-        outputs, found = before.run(dict(each)), after.run(dict(each))
+        outputs, given = before.run(dict(each)), after.run(dict(each))
         for name, expected in (
-            (NOVELTY_OUTPUT, fitted.novelty(outputs[CELLS], outputs[PIXELS])),
-            (DEGRADATION_OUTPUT, fitted.degradation(outputs[CELLS])),
+            (NOVELTY_OUTPUT, found.novelty(outputs[CELLS], outputs[PIXELS])),
+            (DEGRADATION_OUTPUT, found.degradation(outputs[CELLS])),
         ):
-            off = np.abs(found[name] - expected) / np.maximum(1.0, np.abs(expected))
+            off = np.abs(given[name] - expected) / np.maximum(1.0, np.abs(expected))
             # Written so that NaN is a disagreement.
-            if not (off <= _TOLERANCES[name]).all():
+            wrong = ~(off[0] <= _TOLERANCES[name])
+            if wrong.any():
+                number = int(wrong.argmax())
                 raise GateError(
-                    f"export: expected output {name} of the graph to agree with its formula within "
-                    f"{np.min(_TOLERANCES[name]):g}, found a difference of {off.max():.3g}"
+                    f"export: expected number {number} of output {name} of the graph to agree with "
+                    f"its formula within {_TOLERANCES[name][number]:g}, found a difference of "
+                    f"{off[0, number]:.3g}"
                 )

@@ -4,8 +4,8 @@ The features of a frame are a coarse grid of K cells with C channels each. Five 
 of the exported graph; ``novelty`` has four, ``degradation`` one:
 
 ``nearest``
-    Largest distance of a cell to the same cell of any training frame, of which 128 prototypes are
-    kept (k centres, Gonzalez 1985).
+    Distance of a cell to the nearest of 250 prototypes, which are the same cell of training frames
+    (k centres, Gonzalez 1985); the largest of all cells.
 ``cell``, ``mean``
     Mahalanobis distance of a cell to a Gaussian of its own (PaDiM, Defard et al. 2021): the largest
     and the root mean square of all cells.
@@ -25,7 +25,7 @@ the largest lambda; in the others the place looks the same everywhere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,10 +34,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Image8 = NDArray[np.uint8]
 
-# Names of the statistics in the order of ``novelty``, then ``degradation``.
-NOVELTY = ("nearest", "cell", "mean", "colour")
-
-PROTOTYPES, _TOP = 128, 16
+PROTOTYPES, _TOP = 250, 32
 # More channels are first reduced to their largest principal components.
 _CHANNELS = 128
 # Share of the mean variance that keeps covariances of few frames invertible.
@@ -110,19 +107,12 @@ class Familiarity:
 
     def reduced(self, cells: NDArray[np.float32]) -> Array:
         """Cells (n, K, raw channels) -> (n, K, C)."""
-        found = cells.astype(np.float64)
-        return found if self.basis is None else found @ self.basis
+        return _reduced(cells, self.basis)
 
     def projected(self, cells: NDArray[np.float32]) -> Array:
         """Cells (n, K, raw channels) -> z (n, K, C)."""
         centred = self.reduced(cells) - self.mean
         return np.asarray(np.einsum("nkc,kcd->nkd", centred, self.projection.astype(np.float64)))
-
-    @property
-    def finite(self) -> bool:
-        """Whether all constants are finite."""
-        values = (getattr(self, each.name) for each in fields(self))
-        return all(np.isfinite(value).all() for value in values if value is not None)
 
 
 def fitted(
@@ -148,11 +138,7 @@ def fitted(
     """
     basis = _basis(cells)
 
-    def reduced(values: NDArray[np.float32]) -> Array:
-        found = values.astype(np.float64)
-        return found if basis is None else found @ basis
-
-    known, copied = reduced(cells), reduced(harmless[1])
+    known, copied = _reduced(cells, basis), _reduced(harmless[1], basis)
     mean = known.mean(axis=0)
     # A difference of two frames has twice the variance of either.
     changes = np.concatenate(
@@ -170,7 +156,7 @@ def fitted(
     top = min(_TOP, channels)
     prototypes = np.stack([_centres(z[:, k, :top], PROTOTYPES) for k in range(z.shape[1])])
     clean = np.concatenate([summary(known), summary(copied)])
-    weights, bias = _logistic(clean, summary(reduced(noisy)))
+    weights, bias = _logistic(clean, summary(_reduced(noisy, basis)))
     colours = colour_numbers(_recoloured(pixels, seed))
     return Familiarity(
         basis=basis,
@@ -183,6 +169,11 @@ def fitted(
         colour_mean=colours.mean(axis=0),
         colour_whitening=_whitening(colours),
     )
+
+
+def _reduced(cells: NDArray[np.float32], basis: Array | None) -> Array:
+    found = cells.astype(np.float64)
+    return found if basis is None else found @ basis
 
 
 def _basis(cells: NDArray[np.float32]) -> Array | None:

@@ -9,11 +9,10 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from cvo_edge.bundle.format import DEGRADATION_OUTPUT, NOVELTY_OUTPUT
+from cvo_edge.bundle.format import DEGRADATION_OUTPUT, FAMILIARITY, NOVELTY_OUTPUT
 from cvo_export.graph.familiarity import (
     LARGEST_LOGIT,
     LARGEST_NOVELTY,
-    NOVELTY,
     Familiarity,
     in_rgb,
     quarters,
@@ -47,8 +46,8 @@ def with_familiarity(content: bytes, fitted: Familiarity) -> bytes:
     graph.initializer.extend(nodes.constants)
     del graph.output[:]
     graph.output.extend(kept)
-    for name, size in ((NOVELTY_OUTPUT, len(NOVELTY)), (DEGRADATION_OUTPUT, 1)):
-        graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, size]))
+    for name, shape in FAMILIARITY.items():
+        graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
     written: bytes = model.SerializeToString()
     return written
 
