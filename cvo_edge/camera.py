@@ -7,6 +7,7 @@ given by its normalised coordinates (x/z, y/z).
 from __future__ import annotations
 
 import math
+import os
 import re
 from pathlib import Path
 from typing import Annotated, Literal
@@ -184,6 +185,10 @@ def read_camera(given: str | Path) -> Camera:
             raise UsageError(
                 f"camera: expected WIDTHxHEIGHT,FX,FY,CX,CY in pixels, found {given}: {error}"
             ) from None
+    if not os.path.lexists(path) or not str(given):
+        raise UsageError(
+            f"camera: expected WIDTHxHEIGHT,FX,FY,CX,CY or a JSON file, found {given}: no such file"
+        )
     content = read_regular_file(path, _LARGEST_FILE, UsageError, links=True)
     try:
         return msgspec.json.decode(content, type=Camera)

@@ -180,9 +180,16 @@ def own_folder(variable: str, base_variable: str, base: str) -> Path:
 
 
 def refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
-    """Raise UsageError if the output is an input, or lies in an input's folder or glob."""
-    written = Path(output)
-    if output == "-" or not os.path.exists(written):  # noqa: PTH110 - also of a name too long
+    """Raise UsageError if the output is an input, or lies in an input's folder or glob.
+
+    Neither needs to exist: some inputs are written, too.
+    """
+    if output == "-":
+        return
+    written, place = Path(output), os.path.realpath(output)
+    if any(given is not None and os.path.realpath(given) == place for given in inputs):
+        raise UsageError(f"output: expected a new file, found {output} among the inputs")
+    if not os.path.exists(written):  # noqa: PTH110 - also of a name too long
         return
     for given in inputs:
         if given is None:

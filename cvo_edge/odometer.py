@@ -25,7 +25,7 @@ from cvo_edge.engine.session import Session
 from cvo_edge.errors import ModelError, UsageError
 from cvo_edge.estimate import Drift, PoseInterval, Reason, Status
 from cvo_edge.input.clock import SYSTEM_CLOCK
-from cvo_edge.input.frame import Frame
+from cvo_edge.input.frame import Frame, checked_hint
 from cvo_edge.monitor.adaptation import Adaptation
 from cvo_edge.monitor.labelled import Labelled
 from cvo_edge.monitor.watch import StreamWatch
@@ -202,8 +202,10 @@ class Odometer(Labelled):
         return self._observer.session
 
     def close(self) -> None:
-        """Release the model's memory; repeated calls are harmless, later steps raise."""
+        """Release model and state file; repeated calls are harmless, later steps raise."""
         self._observer.close()
+        if self._adaptation is not None:
+            self._adaptation.close()
 
     def step(
         self,
@@ -240,7 +242,8 @@ class Odometer(Labelled):
         Raises
         ------
         UsageError
-            The odometer is closed or was loaded before a fork, or the stamp is not an int.
+            The odometer is closed or was loaded before a fork, the stamp is not an int, or
+            ``moving`` is not a bool.
         ModelError
             Inference failed.
         """
@@ -248,6 +251,7 @@ class Odometer(Labelled):
             stamp_ns = None if stamp_ns is None else index(stamp_ns)
         except TypeError:
             raise UsageError(f"stamp_ns: expected an int or None, found {stamp_ns!r}") from None
+        moving = checked_hint(moving)
         frame = Frame(image_bgr, stamp_ns, source, read_ms, fresh_noise=fresh_noise, moving=moving)
         # Stream checks compare consecutive frames, so threads must not interleave.
         with self._stepping:
@@ -273,6 +277,7 @@ class Odometer(Labelled):
                 f"stream: expected frames or a source, found the path {os.fsdecode(frames)}; use "
                 "odometer.stream(open_source(path))"
             )
+        moving = checked_hint(moving)
         self._watch = StreamWatch(self._observer, self.calibration)
         with closing(
             run_stream(

@@ -6,7 +6,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 from numpy.typing import NDArray
+
+from cvo_edge.errors import UsageError
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +46,15 @@ class Frame:
     def since_arrival_ms(self, now_s: float) -> float:
         """Return the time from the frame's arrival until ``now_s``, 0 if it does not age."""
         return 0.0 if self.arrived_s is None else 1e3 * (now_s - self.arrived_s)
+
+
+def checked_hint(moving: object) -> bool | None:
+    """Return what a caller knows of the camera's motion; raises UsageError unless it is a bool."""
+    if moving is None:
+        return None
+    if isinstance(moving, bool | np.bool_):
+        return bool(moving)
+    raise UsageError(f"moving: expected a bool or None, found {type(moving).__name__}")
 
 
 @runtime_checkable

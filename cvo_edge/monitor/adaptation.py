@@ -72,6 +72,17 @@ class Update(NamedTuple):
     factor: tuple[float, ...]
 
 
+class Adapted(NamedTuple):
+    """What the thresholds of the next frames come from.
+
+    ``labels``: how many; ``frozen``: whether labels change nothing; ``factor``: as in ``Update``.
+    """
+
+    labels: int
+    frozen: bool
+    factor: tuple[float, ...]
+
+
 class Level(NamedTuple):
     """The thresholds for the next frames: as an entry of the bundle, and the x that they come from.
 
@@ -169,6 +180,7 @@ class Adaptation:
         self._frames: dict[int, _Frame] = {}
         self._last_label: int | None = None
         self._lock = Lock()
+        self._owner, self._closed = os.getpid(), False
 
     @property
     def level(self) -> Level:
@@ -176,9 +188,9 @@ class Adaptation:
         return self._level
 
     @property
-    def labels(self) -> int:
-        """Number of labels behind the thresholds."""
-        return self._state.labels
+    def adapted(self) -> Adapted:
+        """What the thresholds of the next frames come from."""
+        return Adapted(self._state.labels, self._state.frozen, self._level.factor)
 
     def remember(self, seq: int, level: Level, observation: Observation | None) -> None:
         """Keep a frame for a later label; the oldest of more than ``KEPT`` frames is dropped.
@@ -203,6 +215,7 @@ class Adaptation:
         """Take the true pose of a frame; see ``Odometer.update``."""
         truth = pose if isinstance(pose, Pose) else Pose.from_array(pose)
         with self._lock:
+            self._check_usable()
             frame = self._frame(seq)
             if frame.kept is None:
                 frame.labelled = True
@@ -221,13 +234,32 @@ class Adaptation:
     def freeze(self) -> None:
         """Keep the present thresholds; see ``Odometer.freeze``."""
         with self._lock:
+            self._check_usable()
             self._keep(replace(self._state, frozen=True))
 
     def reset(self) -> None:
         """Return to the calibrated thresholds; see ``Odometer.reset``."""
         with self._lock:
+            self._check_usable()
             self._keep(State((0.0,) * self._alpha.size))
             self._level = self._at(np.zeros(self._alpha.shape))
+
+    def close(self) -> None:
+        """Let another odometer use the state file; labels are refused from now on."""
+        with self._lock:
+            self._closed = True
+            if self._file:
+                self._file.release()
+
+    def _check_usable(self) -> None:
+        """Raise UsageError after ``close``, and in a forked process, whose parent has the file."""
+        if self._closed:
+            raise UsageError("the odometer is closed; load it again")
+        if os.getpid() != self._owner:
+            raise UsageError(
+                "labels: this process was forked after the odometer was loaded; load it again in "
+                "this process"
+            )
 
     def _frame(self, seq: int) -> _Frame:
         """Return the frame of this number; raises UsageError if it cannot be labelled."""

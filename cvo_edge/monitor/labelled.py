@@ -5,18 +5,24 @@ from __future__ import annotations
 from numpy.typing import ArrayLike
 
 from cvo_edge.errors import UsageError
-from cvo_edge.monitor.adaptation import Adaptation, Update
+from cvo_edge.monitor.adaptation import Adaptation, Adapted, Update
 from cvo_edge.pose import Pose
 
 
 class Labelled:
     """Takes true poses of single frames, and adapts the thresholds to them.
 
-    Every method raises UsageError unless the odometer was loaded with ``adapt`` or ``state``, and
-    SinkError if the state file cannot be written; the call then has changed nothing.
+    Every method raises UsageError unless the odometer was loaded with ``adapt`` or ``state``, after
+    ``close`` and in a forked process, and SinkError if the state file cannot be written; the call
+    then has changed nothing.
     """
 
     _adaptation: Adaptation | None = None
+
+    @property
+    def adapted(self) -> Adapted | None:
+        """What the thresholds are adapted to; None unless loaded with ``adapt`` or ``state``."""
+        return None if self._adaptation is None else self._adaptation.adapted
 
     def update(self, seq: int, pose: Pose | ArrayLike) -> Update:
         """Take the true ``T_world_camera`` (Pose or shape (7,)) of a frame, now or later.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import math
 import os
+import weakref
 import zlib
 from contextlib import suppress
 from glob import escape
@@ -14,7 +16,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from cvo_edge.bundle.format import Calibration, Sha256, one_line
-from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError
+from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, SinkError
 from cvo_edge.files import read_regular_file, write_whole
 from cvo_edge.vocabulary import Scope
 
@@ -57,8 +59,9 @@ class _Stored(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class StateFile:
     """A state file of one bundle, confidence and scope, for one odometer at a time.
 
-    Each write replaces the file as a whole and reaches the disk before it returns: a kill or a
-    power cut at any point leaves the old state or the new one.
+    While it is used, ``FILE.lock`` beside it is locked against other odometers; the lock ends with
+    the process. Each write replaces the file as a whole and reaches the disk before it returns: a
+    kill or a power cut at any point leaves the old state or the new one.
 
     Parameters
     ----------
@@ -79,6 +82,7 @@ class StateFile:
         self._name, self._digest = calibration.name, calibration.digest
         self._confidence: float = confidence
         self._scope: Scope = scope
+        self._release: weakref.finalize[..., StateFile] | None = None
 
     def read(self, size: int) -> State | None:
         """Return the stored state of ``size`` factors, or None without a file.
@@ -89,7 +93,10 @@ class StateFile:
             The file is damaged, of another version, or cannot be read.
         BundleMismatchError
             It belongs to another bundle, confidence or scope.
+        SinkError
+            Another odometer uses it.
         """
+        self._lock()
         self._sweep()
         if not os.path.lexists(self.path):
             return None
@@ -125,6 +132,35 @@ class StateFile:
         )
         write_whole(self.path, stored.encoded(), durable=True)
 
+    def release(self) -> None:
+        """Let other odometers use the file."""
+        if self._release is not None:
+            self._release()
+
+    def _lock(self) -> None:
+        """Lock the file against other odometers; raises SinkError if one of them uses it."""
+        path = self.path.with_name(f"{self.path.name}.lock")
+        while self._release is None:
+            try:
+                descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            except OSError:
+                return  # nothing can be written here either, and the first write says so
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(descriptor)
+                raise SinkError(
+                    f"{self.path}: another odometer adapts with this state; give each its own file"
+                ) from None
+            except OSError:
+                os.close(descriptor)
+                return  # the file system does not support locks
+            # Whoever held the lock before may have removed the file meanwhile.
+            if _is_file(descriptor, path):
+                self._release = weakref.finalize(self, _unlock, descriptor, path, os.getpid())
+            else:
+                os.close(descriptor)
+
     def _sweep(self) -> None:
         """Remove what writes that were killed have left beside the file."""
         for unfinished in self.path.parent.glob(f"{escape(self.path.name)}.*.partial"):
@@ -141,3 +177,17 @@ class StateFile:
         return BundleMismatchError(
             f"{self.path}: expected the state of {expected}, found that of {found}; {_ANOTHER}"
         )
+
+
+def _is_file(descriptor: int, path: Path) -> bool:
+    with suppress(OSError):
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    return False
+
+
+def _unlock(descriptor: int, path: Path, owner: int) -> None:
+    # A forked process shares the lock of its parent, and must leave it.
+    if os.getpid() == owner:
+        with suppress(OSError):
+            path.unlink()
+    os.close(descriptor)

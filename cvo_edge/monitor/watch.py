@@ -8,7 +8,7 @@ from cvo_edge.bundle.format import Calibration
 from cvo_edge.camera_check import LensEstimate
 from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.estimate import Drift, Reason
-from cvo_edge.input.frame import Frame
+from cvo_edge.input.frame import Frame, checked_hint
 from cvo_edge.input.frame_checks import StreamChecks
 from cvo_edge.monitor.alarm import StreamAlarm, false_alarms
 
@@ -49,7 +49,8 @@ class StreamWatch:
         doubts = tuple(reason for reason in own if reason is not None)
         doubts += self._sizes.doubts(observation.look)
         doubts += self._checks.doubts(
-            observation.look, frame.stamp_ns, age_ms, frame.fresh_noise, frame.moving
+            *(observation.look, frame.stamp_ns, age_ms, frame.fresh_noise),
+            checked_hint(frame.moving),
         )
         if self._camera_differs(observation, doubts):
             doubts += (Reason.CAMERA_DIFFERS,)

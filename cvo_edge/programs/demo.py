@@ -75,11 +75,18 @@ def demo(bundle: Path, picture: Path) -> None:
         print("...", *summary.lines(), sep="\n")
         if expected:
             print(_indented("expected", expected))
+        if not summary.bounded:
+            raise UsageError(
+                f"demo: expected a bundle that was trained on the clip's scene (synthetic-room-*), "
+                f"found {name}, which gives no frame an interval"
+            )
+        if summary.in_alarm:
+            print(_indented("alarm", _false_alarm(odometer.drift.false_alarms)))
         notes = [_found(summary), f"Expected: {expected}" if expected else ""]
         span = None
         if odometer.calibration.alarm is None:
             print(_indented("hand", "not shown: it takes an alarm, and this bundle has none"))
-        elif summary.bounded:  # if not, the clip is no scene of this bundle
+        else:
             frames = list(covered(open_source(str(CLIP))))
             estimates, told = _with_hand(odometer, frames, estimates, truth, table)
             notes = [f"Without the hand: {note}" for note in notes[:1] if note] + notes[1:]
@@ -95,6 +102,12 @@ def demo(bundle: Path, picture: Path) -> None:
     )
     write_png(picture, drawn)
     print(picture)
+
+
+def _false_alarm(bound: float | None) -> str:
+    """Return in words what an alarm on the clip, whose images are right, is."""
+    text = "nothing is wrong with these images: it is a false one"
+    return text if bound is None else f"{text}, as in at most {bound:.0%} of new recordings"
 
 
 def _with_hand(

@@ -17,6 +17,7 @@ from cvo_edge.estimate import Drift, PoseInterval, Status
 from cvo_edge.ground_truth import GroundTruth
 from cvo_edge.input.frame import Source
 from cvo_edge.input.image_files import ImageFiles, left_out_text
+from cvo_edge.monitor.adaptation import Adapted
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.labels import Labels
 from cvo_edge.programs.measure import LatencyProfile, memory_mib
@@ -37,8 +38,8 @@ class RunSummary:
     those whose set holds the true value, per degree of freedom; ``camera`` is what the frames show
     of the camera, if they do; ``left_out`` counts the images of a folder that are no frames,
     ``unproven`` the frames whose equal parts prove no repetition; ``labels`` are those that the
-    thresholds have adapted to; ``in_alarm`` counts frames during an alarm, and ``drift`` is the
-    last frame's.
+    thresholds have adapted to, ``adapted`` is what they came to; ``in_alarm`` counts frames during
+    an alarm, and ``drift`` is the last frame's.
     """
 
     dof: tuple[str, ...]
@@ -61,6 +62,7 @@ class RunSummary:
     drift: Drift | None = None
     left_out: Mapping[str, int] = field(default_factory=dict)
     labels: Labels | None = None
+    adapted: Adapted | None = None
     unproven: int = 0
     # Frames are numbered from 0, so that dropped frames at the start are counted, too.
     _last_seq: int = -1
@@ -129,6 +131,8 @@ class RunSummary:
             )
         if self.labels is not None:
             lines.append(self.labels.line())
+        if self.adapted is not None:
+            lines.append(_adapted_line(self.adapted))
         latency = self.latency.summary()
         if latency:
             total, model = latency["total"], latency["model"]
@@ -143,7 +147,11 @@ class RunSummary:
         units = ["cm"] * 3 + ["deg"] * 3
         lines.append(f"at {self.confidence:g} {self.scope}" + "".join(f"{n:>9}" for n in self.dof))
         if self.bounded:
-            cells = "".join(f"{f'{v:.1f} {u}':>9}" for v, u in zip(shown, units, strict=True))
+            # Three digits before the point leave no room for one after it.
+            cells = "".join(
+                f"{f'{v:.1f} {u}' if v < 99.95 else f'{v:.0f} {u}':>9}"
+                for v, u in zip(shown, units, strict=True)
+            )
             lines.append("mean width".ljust(len(lines[-1]) - 54) + cells)
         if self.with_truth and not self.compared:
             nothing = "no frame matched the ground truth, by name or by stamp"
@@ -158,6 +166,14 @@ class RunSummary:
                 + f"   all six {self.covered_jointly / self.compared:.3f} of {self.compared} frames"
             )
         return lines
+
+
+def _adapted_line(adapted: Adapted) -> str:
+    if not adapted.labels:
+        return "thresholds  as calibrated: no label yet" + ", frozen" * adapted.frozen
+    frozen = " and frozen" * adapted.frozen
+    factors = " ".join(f"{each:.3g}" for each in adapted.factor)
+    return f"thresholds  adapted to {adapted.labels} labels{frozen}: {factors} x the calibrated"
 
 
 def run(
@@ -193,3 +209,4 @@ def run(
     finally:
         summary.camera = odometer.seen_camera
         summary.unproven = odometer.unproven_frames
+        summary.adapted = odometer.adapted

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import os
 import re
 import shutil
 from collections import deque
@@ -197,7 +198,7 @@ def test_labels_out_of_order_are_used(adapting):
         show(adaptation, seq)
     for seq in (7, 2, 9, 0):
         assert adaptation.update(seq, pose_at(0.0)).covered == (True,)
-    assert adaptation.labels == 4
+    assert adaptation.adapted.labels == 4
 
 
 @pytest.mark.parametrize(
@@ -240,7 +241,7 @@ def test_a_frame_without_an_interval_changes_nothing(adapting):
     assert adaptation.update(0, pose_at(99.0)) == (None, (1.0,))
     with pytest.raises(UsageError, match="has a label already"):
         adaptation.update(0, pose_at(99.0))
-    assert adaptation.labels == 0
+    assert adaptation.adapted.labels == 0
 
 
 # -- the state file -------------------------------------------------------------------------------
@@ -264,17 +265,62 @@ def test_the_state_survives_and_reset_returns(adapting, path):
     first.freeze()
     show(first, 9)
     assert first.update(9, pose_at(99.0)).covered == (False,)
+    first.close()
     path.with_name("state.json.0badcafe.partial").write_bytes(b"{")
     again = adapting(state=path)
-    assert list(path.parent.iterdir()) == [path]
+    lock = path.with_name("state.json.lock")
+    assert sorted(path.parent.iterdir()) == [path, lock]
     assert again.level.threshold == first.level.threshold
-    assert (again.labels, again.level.factor) == (5, first.level.factor)
+    assert again.adapted == (5, True, first.level.factor)
     show(again, 0)
     assert again.update(0, pose_at(99.0)).factor == first.level.factor
     again.reset()
-    assert adapting(state=path).level.threshold == adapting().level.threshold
     show(again, 1)
-    assert again.update(1, pose_at(99.0)).factor[0] > 1.0
+    assert again.level.threshold == adapting().level.threshold
+    again.close()
+    assert list(path.parent.iterdir()) == [path]
+    last = adapting(state=path)
+    assert last.adapted == (0, False, (1.0,))
+    show(last, 1)
+    assert last.update(1, pose_at(99.0)).factor[0] > 1.0
+
+
+def test_a_state_serves_one_odometer_at_a_time(adapting, path):
+    first = adapting(state=path)
+    with pytest.raises(SinkError, match="another odometer adapts with this state"):
+        adapting(state=path)
+    # The refused one has swept nothing away, and the first one still writes.
+    show(first, 0)
+    assert first.update(0, pose_at(9.0)).factor[0] > 1.0
+    first.close()
+    second = adapting(state=path)
+    assert second.adapted == first.adapted
+    # Another one may have removed the file of the lock and be gone.
+    path.with_name("state.json.lock").unlink()
+    second.close()
+    del second
+    assert adapting(state=path).adapted.labels == 1
+
+
+def test_a_closed_or_forked_odometer_takes_no_labels(adapting, path):
+    first = adapting(state=path)
+    show(first, 0)
+    child = os.fork()
+    if child == 0:
+        refused = 0
+        for call in (lambda: first.update(0, pose_at(9.0)), first.freeze, first.reset):
+            try:
+                call()
+            except UsageError:
+                refused += 1
+        os._exit(refused)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
+    assert first.update(0, pose_at(9.0)).factor[0] > 1.0
+    first.close()
+    show(first, 1)
+    for call in (lambda: first.update(1, pose_at(9.0)), first.freeze, first.reset):
+        with pytest.raises(UsageError, match="the odometer is closed"):
+            call()
 
 
 def test_any_state_is_read_as_written(state_file):
@@ -345,6 +391,7 @@ def test_a_label_that_cannot_be_written_can_be_given_again(adapting, tmp_path, b
     assert adaptation.level is before
     folder.mkdir()
     assert adaptation.update(0, pose_at(9.0)).factor[0] > 1.0
+    adaptation.close()
     assert StateFile(state, bundle.calibration, 0.9, "joint").read(1).labels == 1
 
 
@@ -406,10 +453,12 @@ def test_the_command_gives_labels_late_and_keeps_the_state(
     factors, said = run("--labels", clip_dir, "--label-delay", 4)
     assert factors[:5] == [[1.0] * 6] * 5
     assert factors[5] != factors[4]
-    assert "labels      2 used; factor " in said
+    assert re.search(r"^labels      2 used, [0-2] outside, 4 too late$", said, re.MULTILINE)
+    assert "thresholds  adapted to 2 labels: " in said
     again, said = run()
     assert again == [again[0]] * 6 != [[1.0] * 6] * 6
-    assert "labels" not in said
+    assert "labels      " not in said
+    assert "thresholds  adapted to 2 labels: " in said
     records = list(read_records(tmp_path / "records.jsonl"))
     assert [list(record.factor) for record in records] == again
     run("--format", "csv", "-o", tmp_path / "records.csv")
