@@ -43,7 +43,7 @@ class Schedule:
 
     @property
     def eta(self) -> float:
-        """The step of adaptation, which is constant for a regular schedule."""
+        """The step of a label; that of the first, with a gap of one frame, a delay makes smaller."""
         return step(self.every, self.delay)
 
 
