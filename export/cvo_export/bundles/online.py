@@ -43,7 +43,7 @@ class Schedule:
 
     @property
     def eta(self) -> float:
-        """The step of a label; that of the first, with a gap of one frame, a delay makes smaller."""
+        """The step of every label but the first, whose gap counts as one frame."""
         return step(self.every, self.delay)
 
 
