@@ -4,11 +4,11 @@
     python bench/alarms.py RUN [DATASET] [--frames 18000] [--json FILE]
 
 The test recordings of the bundle's own data are played again and again, every second time with the
-frames of each recording backwards. Each time exposure (up to a tenth of a stop) and place (up to
+frames of each recording backwards. In each pass exposure (up to a tenth of a stop) and place (up to
 one percent of the width) are drawn again, and each frame has noise of its own (deviation of one
-grey level), so that no frame is a copy. All times are one stream if there are at least 512 test
-frames; with fewer, each time is a stream of its own, because the same frame would come back sooner
-than a robot does. An episode is a run of consecutive frames without an interval.
+grey level), so that no frame is a copy. With at least 512 test frames, all passes form one stream;
+with fewer, each pass is its own, because the same frame would come back sooner than a robot does.
+An episode is a run of consecutive frames without an interval.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ STOPS, LEVELS, SHIFT = 0.1, 1.0, 0.01
 
 
 def passes(subject: Subject) -> Iterator[list[int]]:
-    """Yield the frames of each time that the recordings are played, without end."""
+    """Yield the frames of each pass through the recordings, without end."""
     recordings = by_recording(subject.dataset, subject.roles["test"])
     for number in count():
         step = -1 if number % 2 else 1
@@ -59,11 +59,11 @@ def estimates(subject: Subject, frames: int) -> Iterator[list[PoseInterval]]:
     """Yield the estimates of each stream, ``frames`` in all."""
     random = np.random.default_rng(0)
     dataset = remembered(subject.dataset, 1000)
-    times = passes(subject)
+    order = passes(subject)
     several = len(subject.roles["test"]) >= HORIZON
 
     def images() -> Iterator[Image]:
-        for rows in times:
+        for rows in order:
             yield from again(dataset, rows, random)
             if not several:
                 return

@@ -84,14 +84,16 @@ class Frames:
         }
 
     def with_alarm(self) -> Figures:
-        """Return the share of frames with an interval, and the joint coverage of these."""
+        """Return the share of frames with an interval, and the joint coverage of these.
+
+        A frame with an interval is missed if the truth is outside in any degree of freedom.
+        """
         finite = [(estimate, truth) for estimate, truth in self.given if estimate.bounded]
         inside = [estimate.contains(truth) for estimate, truth in finite]
         return {
             "frames": len(self.given),
             "finite": len(finite) / len(self.given),
             "joint_coverage": float(np.mean(inside)) if inside else None,
-            "finite_and_wrong": (len(inside) - sum(inside)) / len(self.given),
         }
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -104,14 +104,7 @@ def spread(rows: Rows, most: int) -> Rows:
 
 def remembered(dataset: PoseDataset, images: int = 400) -> PoseDataset:
     """Return the data set with its last images kept in memory; they must not be changed."""
-    from dataclasses import replace
-
     return replace(dataset, read_image=lru_cache(maxsize=images)(dataset.read_image))
-
-
-def takes_motion_hint() -> bool:
-    """Whether this release can be told that the camera moves."""
-    return "moving" in inspect.signature(Odometer.step).parameters
 
 
 def played(
@@ -127,7 +120,6 @@ def played(
     ``moving`` is the hint about motion that each step is given; None gives none. One thread: the
     figures do not depend on time, and two programs may run at once.
     """
-    hint = {} if moving is None else {"moving": moving}
     with Odometer(bundle, threads=1, confidence=CONFIDENCE, scope=scope, camera=camera) as odometer:
         for image in images:
-            yield odometer.step(image, **hint)
+            yield odometer.step(image, moving=moving)

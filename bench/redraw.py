@@ -1,19 +1,19 @@
-"""What each rule promises for new recordings: calibration recordings drawn again many times.
+"""What each rule covers of new recordings: calibration recordings drawn again many times.
 
     python bench/redraw.py BUNDLE DATASET [--deals 300] [--json FILE]
 
-The network, val and the self-check stay fixed. In each deal as many recordings as the bundle was
-calibrated on are drawn from those of cal and test; the others are tested. Figures are means over
-all deals at 0.9: coverage per degree of freedom, joint coverage, width and interval score; and the
-median over all deals of the median width over that of the pooled rule (``over_pooled``, mean over
-the degrees of freedom). The rule ``capped`` has its default cap.
+The network, val and the solver's limits stay fixed. In each deal as many recordings as the bundle
+was calibrated on are drawn from those of cal and test; the others are tested. Figures are means
+over all deals at 0.9: coverage per degree of freedom, joint coverage, width and interval score; and
+the median over all deals of the median width over that of the pooled rule (``over_pooled``, mean
+over the degrees of freedom). The rule ``capped`` has its default cap.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +37,21 @@ CONFIDENCE = 0.9
 RULES: tuple[Rule, ...] = get_args(Rule)
 
 
+class Figures(NamedTuple):
+    """Coverage, mean width and median width of each degree of freedom (6,), and two of all."""
+
+    coverage: Array
+    mean_width: Array
+    median_width: Array
+    joint_coverage: float
+    score: float
+
+
 def deal_figures(
     head: Head, cal: Scored, test: Observed, val: Scored, rule: Rule, unit: Array
-) -> dict[str, Array]:
+) -> dict[str, Figures]:
     """Return the figures of one deal by scope; none for a scope with an unbounded threshold."""
-    found: dict[str, Array] = {}
+    found: dict[str, Figures] = {}
     cap = DEFAULT_CAP if rule == "capped" else None
     for entry in thresholds(head, cal, val, rule, "max", cap):
         if entry.confidence != CONFIDENCE or None in entry.q_hat:
@@ -52,13 +62,12 @@ def deal_figures(
         width = np.array([each.width() for each in sets])
         distance = np.array([each.distance(y) for each, y in zip(sets, test.truth, strict=True)])
         score = interval_score(width, distance, 1.0 - CONFIDENCE) / unit
-        found[entry.scope] = np.concatenate(
-            [
-                covered.mean(axis=0),
-                width.mean(axis=0),
-                [np.mean(inside), score.mean()],
-                np.median(width, axis=0),
-            ]
+        found[entry.scope] = Figures(
+            coverage=covered.mean(axis=0),
+            mean_width=width.mean(axis=0),
+            median_width=np.median(width, axis=0),
+            joint_coverage=float(np.mean(inside)),
+            score=float(score.mean()),
         )
     return found
 
@@ -88,30 +97,34 @@ def main() -> None:
             "cal and test"
         )
     generator = np.random.default_rng(0)
-    collected: dict[tuple[str, str], list[Array]] = {}
+    collected: dict[tuple[str, str], list[tuple[Figures, float]]] = {}
     for _ in range(arguments.deals):
         drawn = np.isin(seen.sequence, generator.permutation(recordings)[:count])
         cal, test = seen.where(drawn).scored(head), seen.where(~drawn)
         dealt = {rule: deal_figures(head, cal, test, val, rule, unit) for rule in RULES}
         for rule, scopes in dealt.items():
-            for scope, values in scopes.items():
-                over = np.mean(values[14:] / dealt["pooled"][scope][14:])
-                collected.setdefault((rule, scope), []).append(np.append(values[:14], over))
+            for scope, found in scopes.items():
+                over = np.mean(found.median_width / dealt["pooled"][scope].median_width)
+                collected.setdefault((rule, scope), []).append((found, float(over)))
     figures: dict[str, Any] = {}
     print(f"{arguments.deals} deals: {count} of {len(recordings)} recordings calibrate")
-    for (rule, scope), values in collected.items():
-        mean, over = np.mean(values, axis=0), float(np.median(np.array(values)[:, 14]))
+    for (rule, scope), deals in collected.items():
+        coverage = np.mean([each.coverage for each, _ in deals], axis=0)
+        width = np.mean([each.mean_width for each, _ in deals], axis=0)
+        joint = float(np.mean([each.joint_coverage for each, _ in deals]))
+        score = float(np.mean([each.score for each, _ in deals]))
+        over = float(np.median([ratio for _, ratio in deals]))
         figures.setdefault(rule, {})[scope] = {
-            "coverage": mean[:6].tolist(),
-            "mean_width": mean[6:12].tolist(),
-            "joint_coverage": float(mean[12]),
-            "normalised_interval_score": float(mean[13]),
+            "coverage": coverage.tolist(),
+            "mean_width": width.tolist(),
+            "joint_coverage": joint,
+            "normalised_interval_score": score,
             "over_pooled": over,
         }
         print(
-            f"{rule:<13} {scope:<9} coverage {mean[:6].mean():.3f} (least {mean[:6].min():.3f}), "
-            f"joint {mean[12]:.3f}, width {100 * mean[6:9].mean():.2f} cm "
-            f"{np.rad2deg(mean[9:12].mean()):.2f} deg, score {mean[13]:.3f}, "
+            f"{rule:<13} {scope:<9} coverage {coverage.mean():.3f} (least {coverage.min():.3f}), "
+            f"joint {joint:.3f}, width {100 * width[:3].mean():.2f} cm "
+            f"{np.rad2deg(width[3:].mean()):.2f} deg, score {score:.3f}, "
             f"width over pooled {over:.3f}"
         )
     if arguments.json:

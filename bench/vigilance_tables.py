@@ -20,6 +20,8 @@ FOLDER = "vigilance"
 STATES = ("before", "after")
 NAME = re.compile(r"(?P<state>before|after)-(?P<program>[a-z]+)-(?P<bundle>.+?)(?:-\d+)?")
 NOTHING = "Not measured yet."
+# One room and world frame: kitchen_flights is rendered from a reconstruction of redkitchen.
+KITCHEN = ("flights", "kitchen_flights", "redkitchen")
 # Kinds that the table of the worst names.
 WORST, OVER = 10, 0.15
 
@@ -107,7 +109,7 @@ def wrong_shares(seeds: list[Report], family: str | None = None) -> dict[str, fl
 
 
 def families() -> str:
-    """Return median, number over .15 and worst kind by family."""
+    """Return the median and the number of kinds over .15, by family."""
     columns = _columns(reports("frames"))
     if not columns:
         return NOTHING
@@ -143,7 +145,7 @@ def worst() -> str:
 
 
 def hinted() -> str:
-    """Return frozen kinds with fresh noise, with and without the hint that the camera moves."""
+    """Return the kinds of one still image, without and with the hint that the camera moves."""
     rows = []
     for head, seeds in _columns(reports("frames")):
         for name in seeds[0]["hinted"]:
@@ -172,6 +174,11 @@ def harmless() -> str:
     return table(["share of frames without an interval", *(head for head, _ in columns)], rows)
 
 
+def same_room(bundle: str, room: str) -> bool:
+    """Whether a data set shows the room that a bundle was made in, in the same world frame."""
+    return room in KITCHEN and bundle.split("-")[0] in KITCHEN
+
+
 def rooms() -> str:
     """Return the share of finite intervals in other rooms."""
     rows = []
@@ -180,7 +187,11 @@ def rooms() -> str:
             room for seeds in states.values() for each in seeds for room in each["rooms"]
         )
         rows += [
-            [bundle, name, *(_room(states.get(state, []), name) for state in STATES)]
+            [
+                bundle,
+                f"{name} (the same room)" if same_room(bundle, name) else name,
+                *(_room(states.get(state, []), name) for state in STATES),
+            ]
             for name in names
         ]
     return table(["bundle", "room", *STATES], rows) if rows else NOTHING
@@ -232,26 +243,22 @@ def _noise(entries: list[Report]) -> list[str]:
 
 
 def false_alarms() -> str:
-    """Return the frames without an interval in long streams of right frames."""
+    """Return the frames without an interval in long streams of right frames, with an alarm."""
     rows = []
-    for bundle, states in (found := reports("alarms")).items():
-        for state in STATES:
-            for report in states.get(state, ()):
-                reasons = (f"{reason} {n:,}" for reason, n in report["reasons"].items())
-                rows.append(
-                    [
-                        title(bundle, states),
-                        state,
-                        f"{report['doubted']:,} of {report['frames']:,}",
-                        f"{report['episodes']:,}",
-                        f"{report['streams_with_doubts']} of {report['streams']}",
-                        ", ".join(reasons) or "-",
-                    ]
-                )
-    if not found:
-        return NOTHING
-    head = ["bundle", "", "frames without an interval", "episodes", "streams with one"]
-    return table([*head, "reasons"], rows)
+    for bundle, states in reports("alarms").items():
+        for report in states.get("after", ()):
+            reasons = (f"{reason} {n:,}" for reason, n in report["reasons"].items())
+            rows.append(
+                [
+                    title(bundle, states),
+                    f"{report['doubted']:,} of {report['frames']:,}",
+                    f"{report['episodes']:,}",
+                    f"{report['streams_with_doubts']} of {report['streams']}",
+                    ", ".join(reasons) or "-",
+                ]
+            )
+    head = ["bundle", "frames without an interval", "episodes", "streams with one", "reasons"]
+    return table(head, rows) if rows else NOTHING
 
 
 TABLES: dict[str, Callable[[], str]] = {

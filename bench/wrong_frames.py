@@ -20,7 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from played import Image, Rows, Seen, Subject, by_recording, played, remembered, takes_motion_hint
+from played import Image, Rows, Seen, Subject, by_recording, played, remembered
 from provenance import write_result
 from wrong_kinds import HARMLESS, WRONG, Kind, frame
 
@@ -137,10 +137,9 @@ def report(subject: Subject, frames: int) -> Figures:
         add("harmless", kind.name, {**figures, "changed": True})
     for kind in WRONG:
         add("wrong", kind.name, measure(subject, kind, frames))
-    if takes_motion_hint():
-        for kind in (kind for kind in WRONG if kind.still):
-            figures = measure(subject, kind, frames, moving=True)
-            add("hinted", f"{kind.name}, with the hint", figures)
+    for kind in (kind for kind in WRONG if kind.still):
+        figures = measure(subject, kind, frames, moving=True)
+        add("hinted", f"{kind.name}, with the hint", figures)
     wrong = found["wrong"].values()
     summaries = {
         "all": summary(wrong),

@@ -10,8 +10,9 @@ Where the parameters come from:
   so results mark them. No other kind comes from there: all others are left out of any fit.
 - Formats are memory layouts of video drivers (V4L2: BGR3, RGB3, NV12, YUYV, raw RGGB) read as
   another one; colour bars, black-and-white boards and "no signal" are what capture cards show.
-- Rings of 2 and 9 buffers are usual driver queues, one within and one beyond the eight images that
-  ``cvo_edge.input.frame_checks`` remembers; 40 is a recording that is played in a loop.
+- Rings of 2, 9 and 40 buffers test repetition at three distances, all within the 256 frames that
+  ``cvo_edge.input.repetition`` remembers: 2 and 9 are usual driver queues, 40 is a short recording
+  that is played in a loop.
 - All other strengths were chosen by eye on a contact sheet (``wrong_frames.py --sheet``), so that a
   person notices the fault at once, and not by what a bundle says to them.
 - Harmless changes are what ordinary cameras and encoders differ by.

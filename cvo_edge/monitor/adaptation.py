@@ -358,9 +358,10 @@ def step(gap: int, delay: int) -> float:
 def error_bound(labels: int, eta: float, under_way: float) -> float:
     """Return the bound on |share of labelled frames that were missed - alpha|.
 
-    It is (13.8 + (1 + d) eta) / (eta T) for T ``labels`` with the constant step ``eta``, of which
-    d = ``under_way`` are given before the first of them arrives; 13.8 = 2 ln 1000. The scores of
-    labelled frames must lie within a factor of 1,000 of the calibrated threshold (or seven units).
+    It is (13.8 + (1 + d) eta) / (eta T) for T ``labels`` with the step ``eta`` (the first may have
+    a smaller one), of which d = ``under_way`` are given before the first of them arrives; 13.8 =
+    2 ln 1000. The scores of labelled frames must lie within a factor of 1,000 of the calibrated
+    threshold (or seven units).
     """
     return (2.0 * _REACH + (1.0 + under_way) * eta) / (eta * labels)
 

@@ -1,4 +1,4 @@
-"""The command ``drift``: whether recordings are still like those of the calibration."""
+"""The command ``drift``: whether recordings are still exchangeable with the calibration's."""
 
 from __future__ import annotations
 
@@ -30,11 +30,15 @@ class Recording(Struct, frozen=True):
 
 
 class DriftReport(Struct, frozen=True):
-    """All recordings in the order given, and what they were compared with."""
+    """All recordings in the order given, and what they were compared with.
+
+    ``crossed``: other networks judged the calibration's recordings, so that nothing is proven.
+    """
 
     bundle: str
     digest: str
     calibration_recordings: int
+    crossed: bool
     alarm_at: float
     recordings: tuple[Recording, ...]
 
@@ -68,7 +72,12 @@ def drift_of(bundle: str | Path, files: Sequence[str | Path]) -> DriftReport:
             p, capital, alarm = martingale.add(novelty)
         recordings.append(Recording(str(file), len(novelties), judged, novelty, p, capital, alarm))
     return DriftReport(
-        calibration.name, calibration.digest, len(reference), ALARM, tuple(recordings)
+        calibration.name,
+        calibration.digest,
+        len(reference),
+        calibration.calibration.crossed is not None,
+        ALARM,
+        tuple(recordings),
     )
 
 
@@ -123,12 +132,20 @@ def drift_lines(report: DriftReport) -> list[str]:
             f"{each.frames:>8}{each.judged:>8}{novelty:>9}{p:>8}{each.martingale:>12.4g}  "
             f"{printable(each.file)}{'  alarm' if each.alarm else ''}"
         )
-    if not any(each.alarm for each in report.recordings):
+    first = next((each for each in report.recordings if each.alarm), None)
+    if first is None:
         return [*lines, f"clear: the martingale stayed below {report.alarm_at:g}"]
-    first = next(each for each in report.recordings if each.alarm)
     return [
         *lines,
-        f"alarm: the martingale passed {report.alarm_at:g} at {printable(first.file)}; while "
-        f"recordings are like the calibrated ones, it ever does with probability at most "
-        f"{1.0 / report.alarm_at:g}",
+        f"alarm: the martingale reached {report.alarm_at:g} at {printable(first.file)}; "
+        + _proven(report),
     ]
+
+
+def _proven(report: DriftReport) -> str:
+    if report.crossed:
+        return "nothing is proven of how often it does so falsely: the calibration is crossed"
+    return (
+        "if all recordings are exchangeable with the calibrated ones, it ever does so with "
+        f"probability at most {1.0 / report.alarm_at:g}"
+    )

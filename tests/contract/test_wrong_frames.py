@@ -101,24 +101,60 @@ def _frames(wrong, finite):
     }
 
 
+def _noise(finite, coverage):
+    given = {"none": (1.0, 0.9), "speckle": (finite, coverage), "exposure": (0.0, None)}
+    return {
+        "noises": {
+            name: {"with_alarm": {"finite": share, "joint_coverage": covered}}
+            for name, (share, covered) in given.items()
+        }
+    }
+
+
+def test_the_false_alarms_are_those_of_bundles_with_an_alarm(monkeypatch):
+    report = {"doubted": 3, "frames": 8, "episodes": 2, "streams_with_doubts": 1, "streams": 4}
+    states = {"before": [{**report, "reasons": {}}]}
+    monkeypatch.setattr(vigilance_tables, "reports", lambda _: {"a": states})
+    assert vigilance_tables.false_alarms() == vigilance_tables.NOTHING
+    states["after"] = [{**report, "reasons": {"image_degraded": 3}}]
+    *_, row = vigilance_tables.false_alarms().splitlines()
+    assert row == "| a | 3 of 8 | 2 | 1 of 4 | image_degraded 3 |"
+
+
 def test_the_promises_name_the_worst_of_what_was_measured_with_an_alarm(monkeypatch):
     found = {
         "frames": {
             "a": {"before": [_frames(1.0, 1.0)], "after": [_frames(0.2, 0.6)]},
             "b": {"before": [_frames(1.0, 1.0)]},
         },
-        "rooms": {"c": {"after": [{"rooms": {"x": {"finite": 0.0}, "y": {"finite": 0.03}}}]}},
+        "rooms": {
+            "c": {"after": [{"rooms": {"x": {"finite": 0.0}, "y": {"finite": 0.03}}}]},
+            "flights-d": {"after": [{"rooms": {"redkitchen": {"finite": 1.0, "wrong": 0.25}}}]},
+        },
+        "noise": {"c": {"after": [_noise(0.5, 0.75)]}},
     }
     monkeypatch.setattr(promised_table, "reports", lambda program: found.get(program, {}))
     head, _, *rows = promised_table.promised().splitlines()
-    assert head == "| situation | what should happen | proven | a (known frames) | c |"
+    assert head == "| situation | what should happen | proven | a (known frames) | c | flights-d |"
     cells = {row.split(" | ")[0].removeprefix("| "): row.split(" | ")[3:] for row in rows}
     assert cells == {
-        "right frames: false alarms": ["none in .00 (clean), by the alarm .00", "- |"],
-        "right frames, harmlessly changed": ["none in .40 (darker), by the alarm .30", "- |"],
-        "another room": ["-", "interval: at most .030 (y) |"],
-        "wrong frames: frozen": ["median .90; wrong at most .90 (still)", "- |"],
-        "wrong frames: torn": ["median .10; wrong at most .20 (torn)", "- |"],
+        "right frames": ["-", "covered .900 (all six, 0.9)", "- |"],
+        "right frames: false alarms": [
+            "no interval in .00 (clean), by the alarm .00",
+            *("-", "- |"),
+        ],
+        "right frames, harmlessly changed": [
+            "no interval in .40 (darker), by the alarm .30",
+            *("-", "- |"),
+        ],
+        "noise of the study": ["-", "interval .00 to .50; missed at most .12 (speckle)", "- |"],
+        "another room": ["-", "interval: at most .030 (y)", "- |"],
+        "the same room, another camera": [
+            *("-", "-"),
+            "interval 1.00; wrong at most .25 (redkitchen) |",
+        ],
+        "wrong frames: frozen": ["median .90; wrong at most .90 (still)", "-", "- |"],
+        "wrong frames: torn": ["median .10; wrong at most .20 (torn)", "-", "- |"],
     }
-    del found["frames"]["a"]["after"], found["rooms"]
+    del found["frames"]["a"]["after"], found["rooms"], found["noise"]
     assert promised_table.promised() == vigilance_tables.NOTHING

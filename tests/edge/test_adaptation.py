@@ -7,6 +7,7 @@ import re
 import shutil
 from collections import deque
 from itertools import islice
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -174,6 +175,13 @@ def test_delay_and_gaps_do_not_run_away(adapting, delay, gap):
     assert factors.min() > scores.min() * math.exp(-1.5)
     eta = min(0.5 if gap > 20 else 0.3, gap / delay if delay else 1.0)
     assert abs(missed.mean() - 0.1) <= error_bound(missed.size, eta, delay / gap)
+
+
+@pytest.mark.parametrize(("under_way", "first"), [(0.0, 471), (1.0, 481)])
+def test_the_bound_is_below_a_tenth_from_the_label_that_the_guarantee_names(under_way, first):
+    page = (Path(__file__).resolve().parents[2] / "docs" / "guarantee.md").read_text("utf-8")
+    assert error_bound(first, 0.3, under_way) < 0.1 <= error_bound(first - 1, 0.3, under_way)
+    assert re.search(rf"from\s{first}", page)
 
 
 def test_labels_that_come_all_at_once_count_as_one_look(adapting):

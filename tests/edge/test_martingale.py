@@ -112,6 +112,20 @@ def _with_alarm(folder, kind, recordings, n=11):
     return folder
 
 
+def _as_crossed(folder, folds):
+    calibration = read_calibration(folder)
+    replace = msgspec.structs.replace
+    source, provenance = calibration.calibration, calibration.provenance
+    split = replace(provenance.training_split, kind="sequence")
+    options = {**provenance.options, "folds": folds}
+    changed = replace(
+        calibration,
+        calibration=replace(source, split=split, crossed=folds),
+        provenance=replace(provenance, training_split=split, options=options),
+    )
+    (folder / "calibration.json").write_bytes(encode_calibration(changed))
+
+
 def _write(path, folder, *novelties, header=True, **changes):
     calibration = read_calibration(folder)
     first = header_of(calibration, Chart("tangent_predicted"), 0.9, "marginal")
@@ -144,8 +158,27 @@ def test_recordings_are_compared_in_their_order(watched, tmp_path):
         assert (each.p, each.martingale, each.alarm) == bets.add(2.5 + k)
     assert strange[-1].alarm
     assert drift_of(watched, files) == report
-    assert drift_lines(report)[-1].startswith("alarm: the martingale passed 20 at ")
+    last = drift_lines(report)[-1]
+    assert last.startswith("alarm: the martingale reached 20 at ")
+    assert last.endswith(
+        "if all recordings are exchangeable with the calibrated ones, it ever does so with "
+        "probability at most 0.05"
+    )
     assert drift_lines(drift_of(watched, files[:2]))[-1] == "clear: the martingale stayed below 20"
+
+
+def test_nothing_is_proven_for_a_crossed_calibration(watched, tmp_path):
+    files = [_write(tmp_path / f"{k}.jsonl", watched, 2.0 + k) for k in range(12)]
+    report = drift_of(watched, files)
+    assert not report.crossed
+    _as_crossed(watched, 5)
+    files = [_write(tmp_path / f"{k}.jsonl", watched, 2.0 + k) for k in range(12)]
+    crossed = drift_of(watched, files)
+    assert crossed.crossed
+    assert crossed.recordings == report.recordings
+    last = drift_lines(crossed)[-1]
+    assert "nothing is proven" in last
+    assert "probability" not in last
 
 
 def test_the_command_prints_json_and_gates(watched, tmp_path):

@@ -137,5 +137,5 @@ def test_a_stream_with_a_difficulty_scales_its_sets_and_takes_labels(tiny_bundle
         )
         estimate = scaled.step(image)
         update = scaled.update(estimate.seq, dataset.poses[0])
-        if estimate.bounded:
-            assert update.covered is not None
+        assert estimate.bounded
+        assert update.covered is not None

@@ -43,7 +43,7 @@ class Schedule:
 
     @property
     def eta(self) -> float:
-        """The step of adaptation, which is constant for a regular schedule."""
+        """The step of every label but the first, whose gap counts as one frame."""
         return step(self.every, self.delay)
 
 
