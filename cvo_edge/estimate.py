@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import product
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import UNSET, Meta, Struct, UnsetType
 from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.errors import UsageError, printable
@@ -80,6 +80,10 @@ class Drift(NamedTuple):
 _UNKNOWN = Drift("unknown")
 
 
+# Far beyond what an alarm may give.
+_Novelty = Annotated[float, Meta(ge=-1e15, le=1e15)]
+
+
 class _Strict(Struct, frozen=True, forbid_unknown_fields=True):
     """Immutable; unknown keys are an error."""
 
@@ -132,7 +136,7 @@ class Record(_Strict, frozen=True):
     interval: RecordedInterval | None
     latency_ms: dict[str, float]
     factor: tuple[float, ...] | UnsetType = UNSET
-    novelty: float | UnsetType | None = UNSET
+    novelty: _Novelty | UnsetType | None = UNSET
     drift: Literal["clear", "alarm"] | UnsetType = UNSET
 
 

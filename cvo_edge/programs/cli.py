@@ -273,16 +273,17 @@ def drift(
 
     from cvo_edge.programs.drift import drift_lines, drift_of
 
+    # Written so that NaN is refused.
+    if max_martingale is not None and not max_martingale >= 1.0:
+        raise UsageError(f"--max-martingale: expected at least 1, found {max_martingale:g}")
     report = drift_of(bundle, records)
     if as_json:
         print(json.dumps(msgspec.to_builtins(report), indent=1))
     else:
         print(*drift_lines(report), sep="\n")
-    if max_martingale is not None and not report.largest <= max_martingale:
-        raise GateError(
-            f"drift: expected a martingale of at most {max_martingale:g}, found "
-            f"{report.largest:.4g}"
-        )
+    if max_martingale is not None and report.largest > max_martingale:
+        found = f"found {report.largest:.4g}"
+        raise GateError(f"drift: expected a martingale of at most {max_martingale:g}, {found}")
 
 
 @app.command()

@@ -9,7 +9,13 @@ from msgspec import UNSET, Struct
 
 from cvo_edge.bundle.format import Calibration
 from cvo_edge.bundle.reading import read_calibration
-from cvo_edge.errors import BundleMismatchError, CalibrationFileError, SourceError, printable
+from cvo_edge.errors import (
+    BundleMismatchError,
+    CalibrationFileError,
+    SourceError,
+    UsageError,
+    printable,
+)
 from cvo_edge.monitor.martingale import ALARM, RecordingMartingale, mean_novelty
 from cvo_edge.output.records import Header, read_records
 
@@ -58,19 +64,34 @@ def drift_of(bundle: str | Path, files: Sequence[str | Path]) -> DriftReport:
     BundleMismatchError
         Records of another bundle.
     SourceError
-        A file cannot be read, or does not say of which bundle its records are.
+        A file cannot be read, or does not say of which bundle its records are; or no file has a
+        frame that the alarm judged.
+    UsageError
+        A recording is given twice: it would count as two.
     """
     calibration = read_calibration(bundle)
     reference = _reference(calibration)
     martingale = RecordingMartingale(reference)
     recordings, capital, alarm = [], 1.0, False
+    known: dict[tuple[float | None, ...], str | Path] = {}
     for file in files:
-        novelties = list(_novelties(file, calibration))
+        novelties = tuple(_novelties(file, calibration))
+        if novelties in known and any(novelties):
+            raise UsageError(
+                "drift: expected each recording once, found that of "
+                f"{printable(str(known[novelties]))} again in {printable(str(file))}"
+            )
+        known[novelties] = file
         judged, novelty = mean_novelty(novelties)
         p = None
         if novelty is not None:
             p, capital, alarm = martingale.add(novelty)
         recordings.append(Recording(str(file), len(novelties), judged, novelty, p, capital, alarm))
+    if not any(each.judged for each in recordings):
+        raise SourceError(
+            f"drift: expected frames that the alarm judged, found none in {len(files)} recordings; "
+            "see their reasons"
+        )
     return DriftReport(
         calibration.name,
         calibration.digest,
@@ -134,7 +155,9 @@ def drift_lines(report: DriftReport) -> list[str]:
         )
     first = next((each for each in report.recordings if each.alarm), None)
     if first is None:
-        return [*lines, f"clear: the martingale stayed below {report.alarm_at:g}"]
+        passed = sum(not each.judged for each in report.recordings)
+        over = f"; {passed} recordings without a judged frame count for nothing" if passed else ""
+        return [*lines, f"clear: the martingale stayed below {report.alarm_at:g}{over}"]
     return [
         *lines,
         f"alarm: the martingale reached {report.alarm_at:g} at {printable(first.file)}; "

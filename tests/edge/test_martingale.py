@@ -13,7 +13,13 @@ from typer.testing import CliRunner
 
 from cvo_edge.bundle.format import FAMILIARITY, AlarmSpec, TensorSpec
 from cvo_edge.bundle.reading import encode_calibration, read_calibration
-from cvo_edge.errors import BundleMismatchError, CalibrationFileError, GateError, SourceError
+from cvo_edge.errors import (
+    BundleMismatchError,
+    CalibrationFileError,
+    GateError,
+    SourceError,
+    UsageError,
+)
 from cvo_edge.estimate import Record, Status
 from cvo_edge.monitor import martingale
 from cvo_edge.monitor.martingale import ALARM, RecordingMartingale, mean_novelty, mixture, p_value
@@ -164,7 +170,26 @@ def test_recordings_are_compared_in_their_order(watched, tmp_path):
         "if all recordings are exchangeable with the calibrated ones, it ever does so with "
         "probability at most 0.05"
     )
-    assert drift_lines(drift_of(watched, files[:2]))[-1] == "clear: the martingale stayed below 20"
+    assert drift_lines(drift_of(watched, files[:1]))[-1] == "clear: the martingale stayed below 20"
+    assert drift_lines(drift_of(watched, files[:2]))[-1] == (
+        "clear: the martingale stayed below 20; 1 recordings without a judged frame count for "
+        "nothing"
+    )
+    with pytest.raises(SourceError, match="found none in 1 recordings"):
+        drift_of(watched, [files[1]])
+
+
+def test_a_recording_counts_once(watched, tmp_path):
+    first, other = (_write(tmp_path / f"{name}.jsonl", watched, 0.2, 0.4) for name in "ab")
+    for files in ([first, first], [first, other]):
+        with pytest.raises(UsageError, match=r"found that of .*a.jsonl again in .*.jsonl"):
+            drift_of(watched, files)
+
+
+@pytest.mark.parametrize("novelty", [1e308, -1e16])
+def test_a_novelty_that_no_alarm_gives_is_refused(watched, tmp_path, novelty):
+    with pytest.raises(SourceError, match="novelty"):
+        drift_of(watched, [_write(tmp_path / "a.jsonl", watched, novelty, novelty)])
 
 
 def test_nothing_is_proven_for_a_crossed_calibration(watched, tmp_path):
@@ -193,6 +218,10 @@ def test_the_command_prints_json_and_gates(watched, tmp_path):
     assert "expected a martingale of at most 20, found " in str(gated.exception)
     assert len(gated.stdout.splitlines()) == len(files) + 3
     assert run(app, ["drift", str(watched), files[0], "--max-martingale", "20"]).exit_code == 0
+    for limit in ("nan", "-1"):
+        refused = run(app, ["drift", str(watched), files[0], "--max-martingale", limit])
+        assert isinstance(refused.exception, UsageError)
+        assert refused.stdout == ""
 
 
 def test_records_of_another_bundle_are_refused_wherever_they_stand(watched, tmp_path):
