@@ -17,6 +17,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import (
+    FAMILIARITY,
     MAX_NUMBER,
     Calibration,
     PoseLimits,
@@ -235,7 +236,14 @@ def _from_model(
     outputs = {tensor.name: tensor.shape for tensor in spec.outputs}
     shape = spec.inputs[0].shape if len(spec.inputs) == 1 else ()
     image = {"name": "image", "dtype": "uint8", "shape": (1, *shape[1:3], 3)}
-    if outputs not in _FORMS or [_fields(tensor) for tensor in spec.inputs] != [image]:
+    # A graph may also tell how familiar an image is.
+    statistics = {name: shape for name, shape in outputs.items() if name in FAMILIARITY}
+    form = {name: shape for name, shape in outputs.items() if name not in FAMILIARITY}
+    if (
+        form not in _FORMS
+        or statistics not in ({}, FAMILIARITY)
+        or [_fields(tensor) for tensor in spec.inputs] != [image]
+    ):
         raise BundleMismatchError(
             "model: expected the input image uint8 [1, height, width, 3] and the outputs pose "
             "[1, 7], or pose [1, 7], lower [1, 6] and upper [1, 6], found "
@@ -326,5 +334,6 @@ def _with_wider_limits(draft: Draft, poses: Array) -> Draft:
 def _given_candidates(draft: Draft) -> tuple[Candidate, ...]:
     floor = six(HALF_WIDTH_FLOOR * np.array(draft.pose.standard_deviation))
     parameters = CqrParameters(half_width_floor=floor, sides="symmetric")
-    scores = ("residual",) if len(draft.model.outputs) == 1 else ("normalised", "additive")
+    bounds = any(tensor.name == "lower" for tensor in draft.model.outputs)
+    scores = ("normalised", "additive") if bounds else ("residual",)
     return tuple(Candidate(score, parameters) for score in scores)

@@ -71,7 +71,9 @@ def test_summary_has_coverage_where_there_is_ground_truth(bundle_dir, clip_dir, 
     assert "coverage" in result.stderr
     frames = len(list(clip_dir.glob("*.color.jpg")))
     assert len(records_in(out.read_text())) == frames
-    assert f"of {frames} frames" in result.stderr
+    ok = sum(record["status"] == "ok" for record in records_in(out.read_text()))
+    assert ok >= 0.9 * frames
+    assert f"of {ok} frames" in result.stderr
 
 
 def test_the_region_is_recorded_on_request_and_only_where_there_is_one(bundle_dir, clip_dir):
@@ -82,7 +84,7 @@ def test_the_region_is_recorded_on_request_and_only_where_there_is_one(bundle_di
     for record in records_in(result.stdout):
         interval = record["interval"]
         assert interval["region"].keys() == {"radius", "scale", "centres"}
-        assert len(interval["region"]["centres"]) > 1
+        assert len(interval["region"]["centres"]) >= 1
     unbounded = cvo_edge("run", regions, clip_dir, *joint, "--max-frames", 1, "--confidence", 0.99)
     assert records_in(unbounded.stdout)[0]["interval"]["region"] is None
     assert "expected a bundle of mcqr" in refused(cvo_edge("run", regions, clip_dir, "--region"), 2)
@@ -495,7 +497,7 @@ def test_inspect_schema_doctor_and_version_answer(bundle_dir):
     assert as_json["schema_version"] == 1
     schema = json.loads(cvo_edge("schema").stdout)
     calibration = schema["$defs"]["Calibration"]
-    assert set(calibration["required"]) == set(as_json)
+    assert set(calibration["required"]) <= set(as_json) <= set(calibration["properties"])
     assert calibration["additionalProperties"] is False
     assert json.loads(cvo_edge("doctor", "--json").stdout)["cores_allowed"] >= 1
     assert cvo_edge("--version").stdout.startswith("cvo-edge ")

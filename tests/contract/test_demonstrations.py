@@ -54,9 +54,12 @@ def test_eight_bits_cost_little_and_the_file_is_smaller(method, clip_dir):
     frames = list(open_source(str(clip_dir)))
     with Odometer.load(plain) as first, Odometer.load(int8) as second:
         widths = [
-            np.mean([e.conformal_set.width() for e in odometer.stream(frames)], axis=0)
+            np.array([e.conformal_set.width() for e in odometer.stream(frames)])
             for odometer in (first, second)
         ]
+    bounded = np.isfinite(widths).all(axis=(0, 2))
+    assert bounded.mean() >= 0.9
+    widths = [each[bounded].mean(axis=0) for each in widths]
     # Rounding shows in intervals of half a centimetre.
     assert np.mean(widths[1] / widths[0]) < (1.3 if method == "scr" else 1.1)
 
@@ -73,8 +76,10 @@ def test_the_clip_is_covered_about_as_often_as_stated(demonstration, clip_dir, s
     truth = open_ground_truth(clip_dir)
     with Odometer.load(demonstration, scope=scope) as odometer:
         estimates = list(odometer.stream(open_source(str(clip_dir))))
-    assert all(estimate.bounded for estimate in estimates)
-    covered = np.array([estimate.covers(truth.pose_of(estimate)) for estimate in estimates])
+    given = [estimate for estimate in estimates if estimate.bounded]
+    # An alarm may be false, at most in 24 % of such flights.
+    assert len(given) >= 0.9 * len(estimates)
+    covered = np.array([estimate.covers(truth.pose_of(estimate)) for estimate in given])
     assert covered.mean() > 0.75
 
 
@@ -97,13 +102,16 @@ def test_a_solver_gives_the_same_bits_again_and_with_more_threads(precision, cli
 
 @pytest.mark.whole_clip
 def test_every_record_is_json_and_bands_are_ordered_and_disjoint(demonstration, clip_dir):
+    given = 0
     with Odometer.load(demonstration) as odometer:
         for estimate in odometer.stream(open_source(str(clip_dir))):
             record = json.loads(json.dumps(estimate.to_dict(), default=list, allow_nan=False))
             bands = record["interval"]["bands"]
-            assert (bands is None) is (odometer.calibration.method != "csp")
+            given += bands is not None
+            assert bands is None or odometer.calibration.method == "csp"
             for dof, row in enumerate(bands or []):
                 flat = [end for band in row for end in band]
                 assert flat == sorted(set(flat))
                 assert flat[0] == record["interval"]["lower"][dof]
                 assert flat[-1] == record["interval"]["upper"][dof]
+    assert (given >= 45) is (odometer.calibration.method == "csp")

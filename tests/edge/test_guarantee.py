@@ -21,7 +21,7 @@ def said(bundle, make_head):
         kind = changes.pop("kind", "sequence")
         source = bundle.calibration.calibration
         split = msgspec.structs.replace(source.split, kind=kind)
-        defaults = {"rule": "pooled", "n": 500, "n_sequences": 11}
+        defaults = {"rule": "pooled", "cap": None, "n": 500, "n_sequences": 11}
         source = msgspec.structs.replace(source, split=split, **{**defaults, **changes})
         head = make_head(
             "cqr", "additive", {**PARAMETERS, "sides": sides}, q_hat, upper, scope, source.joint

@@ -7,6 +7,7 @@ import threading
 from itertools import pairwise
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -232,10 +233,12 @@ def intervals(estimates):
     }
 
 
-def test_every_mode_gives_the_same_numbers(bundle_dir, clip_dir, clock):
+def test_every_mode_gives_the_same_numbers(bundle, rewrite, clip_dir, clock):
+    # An alarm depends on the frames before, of which live mode drops some.
+    folder = rewrite(msgspec.structs.replace(bundle.calibration, alarm=None))
     found = {}
     for mode in MODES:
-        with Odometer.load(bundle_dir, mode=mode, threads=2) as odometer:
+        with Odometer.load(folder, mode=mode, threads=2) as odometer:
             odometer._clock = clock
             found[mode] = list(odometer.stream(open_source(str(clip_dir), fps=100)))
     latency, throughput = (intervals(found[mode]) for mode in ("latency", "throughput"))

@@ -65,6 +65,8 @@ def test_json_lines_are_the_record(tmp_path, estimates):
             "pose",
             "interval",
             "latency_ms",
+            "novelty",
+            "drift",
         ]
         if estimate.pose is not None:
             assert record["interval"]["lower"] == estimate.lower.tolist()
