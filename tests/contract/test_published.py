@@ -1,7 +1,7 @@
-"""Pre-release bundles yield the numbers they were published with.
+"""The demonstration bundles yield the numbers they were published with.
 
-``data/pre_release.json`` holds thresholds and estimates of the four demonstration bundles on the
-first frames of the demonstration clip, computed by the code that published them.
+``data/published.json`` holds their thresholds and their estimates on the first frames of the
+demonstration clip, computed by the code that published them.
 """
 
 import json
@@ -12,15 +12,15 @@ import pytest
 
 from cvo_edge import Odometer, open_source, read_bundle
 
-BEFORE = json.loads((Path(__file__).parent / "data/pre_release.json").read_bytes())
+PUBLISHED = json.loads((Path(__file__).parent / "data/published.json").read_bytes())
 # Kernels of other processors round differently; a wrong rule would be off by far more.
 TOLERANCE = 1e-4
 
 
-@pytest.mark.parametrize("method", BEFORE)
+@pytest.mark.parametrize("method", PUBLISHED)
 def test_thresholds_are_read_to_the_last_digit(artifacts_dir, method):
     found = read_bundle(artifacts_dir / f"synthetic-room-{method}").calibration.thresholds
-    expected = BEFORE[method]["thresholds"]
+    expected = PUBLISHED[method]["thresholds"]
     assert len(found) == len(expected) == 10
     for entry, (confidence, scope, q_hat, q_hat_upper) in zip(found, expected, strict=True):
         assert (entry.confidence, entry.scope) == (confidence, scope)
@@ -29,11 +29,11 @@ def test_thresholds_are_read_to_the_last_digit(artifacts_dir, method):
 
 
 @pytest.mark.parametrize("scope", ["marginal", "joint"])
-@pytest.mark.parametrize("method", BEFORE)
+@pytest.mark.parametrize("method", PUBLISHED)
 def test_estimates_are_those_of_the_code_that_published_them(
     artifacts_dir, clip_dir, method, scope
 ):
-    expected = BEFORE[method]["estimates"][scope]
+    expected = PUBLISHED[method]["estimates"][scope]
     frames = iter(open_source(clip_dir))
     with Odometer.load(artifacts_dir / f"synthetic-room-{method}", scope=scope) as odometer:
         for before in expected:
