@@ -1,10 +1,10 @@
 """What watching a stream costs: a frame with the alarm and the checks of repetition, and without.
 
-    python bench/vigilance_cost.py BUNDLE FRAMES... [--json FILE]
+    python bench/vigilance_cost.py BUNDLE SOURCE [--json FILE]
 
 The frame without has the same network less the nodes that only the statistics of familiarity need,
 no factor of difficulty, and no stream checks. Both take turns on the same images, on one thread and
-on two: give over 256, so that none is repeated. ``stream`` is the time of the checks after the
+on two; there should be over 256, so that none is repeated. ``stream`` is the time of the checks after the
 network, alone. The file's growth is that of the model.
 """
 
@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from time import perf_counter
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import msgspec
 import numpy as np
 import onnx
@@ -31,6 +31,7 @@ from cvo_edge.input import frame_checks
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.frame_checks import StreamChecks
 from cvo_edge.input.repetition import Digest
+from cvo_edge.input.sources import open_source
 from cvo_edge.monitor.watch import StreamWatch
 from cvo_edge.odometer import Odometer
 from cvo_export.bundles.draft import model_spec
@@ -115,10 +116,11 @@ def main() -> None:
     """Print the figures; write them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("bundle", type=Path)
-    parser.add_argument("frames", type=Path, nargs="+", help="images of the bundle's place")
+    parser.add_argument("source", help="images of the bundle's place, as for cvo-edge run")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    images = [image for path in arguments.frames if (image := cv2.imread(str(path))) is not None]
+    frames = islice(open_source(arguments.source), WARM_UP + ROUNDS)
+    images = [frame.image for frame in frames if frame.image is not None]
     bundle = read_bundle(arguments.bundle)
     plain = without_alarm(bundle)
     report: dict[str, Any] = {

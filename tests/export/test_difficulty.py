@@ -46,6 +46,7 @@ def seen(generator, count, novelty, slopes=SLOPES):
         size=(64, 48),
         invalid=0,
         degraded=0,
+        judged=None,
     )
 
 
