@@ -4,8 +4,8 @@
 
 The frame without has the same network less the nodes that only the statistics of familiarity need,
 no factor of difficulty, and no stream checks. Both take turns on the same images, on one thread and
-on two; there should be over 256, so that none is repeated. ``stream`` is the time of the checks after the
-network, alone. The file's growth is that of the model.
+on two; there should be over 256, so that none is repeated. ``stream`` is the time of the checks
+after the network, alone. The file's growth is that of the model.
 """
 
 from __future__ import annotations
