@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 _LEVEL = 0.9
 # Margin by which another score must win on val; smaller differences may be chance.
 _CLEARLY = 0.05
-# With a difficulty: how much the interval score may rise, and how many misses fewer there must be.
-_PRICE, _GAIN = 0.05, 0.1
+# With a difficulty: how much the interval scores of clean and of noisy frames may rise, and how many
+# misses fewer there must be.
+_PRICES, _GAIN = (0.1, 0.25), 0.1
 # With fewer val frames, the frames that a difficulty is fitted to also decide about it.
 _HALVED = 100
 
@@ -43,9 +44,9 @@ def with_difficulty(draft: Draft, candidate: Candidate, val: Observed, noisy: Ob
     """Return a draft that has no difficulty with one, if val speaks for it.
 
     It is fitted to val frames as they are and to noisy copies of val frames. At thresholds of the
-    frames as they are, a tenth fewer of the noisy truths have to be missed, and neither kind's
-    interval score may rise by more than 5 %. If there are enough val frames, each half of them
-    decides on a difficulty of the other one.
+    frames as they are, a tenth fewer of the noisy truths have to be missed, and the interval score
+    may rise by 10 % for clean frames and by 25 % for noisy ones. If there are enough val frames,
+    each half of them decides on a difficulty of the other one.
     """
     plain = draft.head(candidate)
 
@@ -65,7 +66,7 @@ def with_difficulty(draft: Draft, candidate: Candidate, val: Observed, noisy: Ob
     for fits, decides in zip(halves, reversed(halves), strict=True):
         before += _judged(draft, plain, *decides)
         after += _judged(draft, fitted(*fits).head(candidate), *decides)
-    most = np.array([1.0 + _PRICE, 1.0 + _PRICE, 1.0 - _GAIN])
+    most = np.array([*(1.0 + price for price in _PRICES), 1.0 - _GAIN])
     return fitted(val, noisy) if (after <= most * before).all() else draft
 
 
