@@ -205,6 +205,8 @@ def promised() -> str:
             if states.get(STATE):
                 empty: Measured = {each: [] for each in (*PROGRAMS, SAME_ROOM)}
                 bundles.setdefault(bundle, empty)[program] = states[STATE]
+    # One that nothing but noise was shown to has a table of its own.
+    bundles = {bundle: measured for bundle, measured in bundles.items() if measured["frames"]}
     if not bundles:
         return NOTHING
     heads = [title(bundle, measured) for bundle, measured in bundles.items()]

@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 _LEVEL = 0.9
 # Margin by which another score must win on val; smaller differences may be chance.
 _CLEARLY = 0.05
-# With a difficulty: how much the interval scores of clean and of noisy frames may rise, and how many
-# misses fewer there must be.
+# With a difficulty: how much the interval scores of clean and of noisy frames may rise, and how
+# many misses fewer there must be.
 _PRICES, _GAIN = (0.1, 0.25), 0.1
 # With fewer val frames, the frames that a difficulty is fitted to also decide about it.
 _HALVED = 100
