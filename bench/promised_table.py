@@ -205,8 +205,13 @@ def promised() -> str:
             if states.get(STATE):
                 empty: Measured = {each: [] for each in (*PROGRAMS, SAME_ROOM)}
                 bundles.setdefault(bundle, empty)[program] = states[STATE]
-    # One that nothing but noise was shown to has a table of its own.
-    bundles = {bundle: measured for bundle, measured in bundles.items() if measured["frames"]}
+    # Those that nothing but noise was shown to have a table of their own.
+    others = [program for program in PROGRAMS if program != "noise"]
+    bundles = {
+        bundle: measured
+        for bundle, measured in bundles.items()
+        if any(measured[program] for program in others)
+    }
     if not bundles:
         return NOTHING
     heads = [title(bundle, measured) for bundle, measured in bundles.items()]

@@ -131,7 +131,7 @@ def test_the_promises_name_the_worst_of_what_was_measured_with_an_alarm(monkeypa
             "c": {"after": [{"rooms": {"x": {"finite": 0.0}, "y": {"finite": 0.03}}}]},
             "flights-d": {"after": [{"rooms": {"redkitchen": {"finite": 1.0, "wrong": 0.25}}}]},
         },
-        "noise": {"c": {"after": [_noise(0.5, 0.75)]}},
+        "noise": {"c": {"after": [_noise(0.5, 0.75)]}, "only": {"after": [_noise(1.0, 0.1)]}},
     }
     monkeypatch.setattr(promised_table, "reports", lambda program: found.get(program, {}))
     head, _, *rows = promised_table.promised().splitlines()
