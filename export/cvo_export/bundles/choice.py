@@ -23,7 +23,7 @@ _LEVEL = 0.9
 _CLEARLY = 0.05
 # With a difficulty: how much the interval scores of clean and of noisy frames may rise, and how
 # many misses fewer there must be.
-_PRICES, _GAIN = (0.1, 0.25), 0.1
+_PRICES, _GAIN = (0.15, 1 / 3), 0.1
 # With fewer val frames, the frames that a difficulty is fitted to also decide about it.
 _HALVED = 100
 
@@ -45,7 +45,7 @@ def with_difficulty(draft: Draft, candidate: Candidate, val: Observed, noisy: Ob
 
     It is fitted to val frames as they are and to noisy copies of val frames. At thresholds of the
     frames as they are, a tenth fewer of the noisy truths have to be missed, and the interval score
-    may rise by 10 % for clean frames and by 25 % for noisy ones. If there are enough val frames,
+    may rise by 15 % for clean frames and by a third for noisy ones. If there are enough val frames,
     each half of them decides on a difficulty of the other one.
     """
     plain = draft.head(candidate)
