@@ -1,6 +1,7 @@
 """Splits: each frame has at most one role; gaps, shares, sequences and digests."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -69,9 +70,28 @@ def test_block_leaves_fifteen_frames_between_roles(seed):
     assert (role_of >= 0).sum() >= 600
 
 
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("length", [200, 300, 400, 600])
+def test_block_keeps_three_fifths_of_short_recordings(length, seed):
+    split = make_split(dataset([length]), "block", seed)
+    assert sum(split.roles[role].size for role in ROLES) >= 0.6 * length
+    assert min(split.roles[role].size for role in ROLES) >= 9
+    assert split.blocks is not None
+    # What the frames of different roles are apart is what the split says.
+    role_of = {int(i): role for role in ROLES for i in split.roles[role]}
+    kept = sorted(role_of)
+    apart = [b - a - 1 for a, b in pairwise(kept) if role_of[a] != role_of[b]]
+    assert min(apart) == split.blocks.gap
+    assert (split.blocks.cost is None) == (split.blocks.gap == 15)
+
+
+def test_long_recordings_have_the_usual_blocks():
+    assert make_split(dataset([1000]), "block", 0).blocks == (20, 15)
+
+
 def test_block_refuses_a_recording_that_would_not_survive():
     with pytest.raises(UsageError, match="too short"):
-        make_split(dataset([200]), "block", 0)
+        make_split(dataset([40]), "block", 0)
 
 
 def test_sequence_keeps_sequences_whole_and_respects_the_own_test_list():

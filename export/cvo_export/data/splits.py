@@ -14,7 +14,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -32,10 +32,15 @@ SHARES: dict[Purpose, dict[str, float]] = {
     "calibration": {"val": 0.1, "cal": 0.7, "test": 0.2},
 }
 
-_BLOCKS = 20
-# Frames dropped on either side of a border between blocks of different roles.
-_GAP_BEFORE, _GAP_AFTER = 7, 8
+# Blocks of a recording, and frames dropped at a border between blocks of different roles. The first
+# that leaves enough frames is used: a short recording gets fewer blocks, then narrower gaps.
+_BLOCKS = (
+    *((20, 15), (15, 15), (12, 15), (10, 15)),
+    *((10, gap) for gap in (12, 10, 8, 6, 5, 4, 3)),
+)
 _LEAST_SURVIVING = 0.6
+# Fewer frames in a role, e.g. nine of cal for the level 0.9, decide nothing.
+_ENOUGH = 9
 # The hierarchical rule is finite at 0.9, and capped at 0.95, from nine recordings. With two more,
 # they are finite without one of them, too.
 _CALIBRATION_SEQUENCES, _MANY_SEQUENCES = 11, 30
@@ -43,14 +48,36 @@ _CALIBRATION_SEQUENCES, _MANY_SEQUENCES = 11, 30
 Indices = NDArray[np.int64]
 
 
+class Blocks(NamedTuple):
+    """Blocks of a split: how many, and the frames dropped where neighbours differ in role."""
+
+    pieces: int
+    gap: int
+
+    @property
+    def cost(self) -> str | None:
+        """What a recording too short for usual blocks costs, or None."""
+        usual = Blocks(*_BLOCKS[0])
+        if self.gap == usual.gap:
+            return None
+        return (
+            f"frames of different roles are {self.gap} frames apart instead of {usual.gap}, so "
+            "coverage and errors may look better than on new frames"
+        )
+
+
 @dataclass(frozen=True)
 class Split:
-    """Ascending frame numbers by role; frames in gaps between blocks have no role."""
+    """Ascending frame numbers by role; frames in gaps between blocks have no role.
+
+    ``blocks`` describes a split by block, and is None for the others.
+    """
 
     kind: SplitKind
     seed: int
     purpose: Purpose
     roles: Mapping[str, Indices]
+    blocks: Blocks | None = None
 
     def digest(self, dataset: PoseDataset) -> str:
         """Return a sha256 over frame names and poses by role, which identifies the split.
@@ -96,7 +123,8 @@ def make_split(
     """Assign every frame at most one role.
 
     ``random`` assigns single frames, which are exchangeable by construction but give optimistic
-    figures on video. ``block`` assigns 20 contiguous blocks and drops frames where roles change.
+    figures on video. ``block`` assigns contiguous blocks and drops frames where roles change: 20
+    blocks and 15 frames, or fewer if the recordings are short.
     ``sequence`` assigns whole sequences and respects the data set's own test list. A calibration
     split uses only the sequences on the data set's own test list, if it has one, because networks
     are trained on the others. The same data set and arguments give the same split.
@@ -109,10 +137,11 @@ def make_split(
     if purpose == "calibration" and dataset.own_test:
         frames = np.flatnonzero(np.isin(dataset.sequence, sorted(dataset.own_test)))
         dealt = _part(dataset, frames)
+    blocks = None
     if kind == "random":
         roles = _random(dealt, generator, SHARES[purpose])
     elif kind == "block":
-        roles = _block(dealt, generator, SHARES[purpose])
+        roles, blocks = _block(dealt, generator, SHARES[purpose])
     else:
         roles = _sequence(dealt, generator, SHARES[purpose])
     roles = {role: frames[indices] for role, indices in roles.items()}
@@ -122,7 +151,7 @@ def make_split(
             f"split {kind}: expected frames for every role, found none for {', '.join(empty)} "
             f"among {frames.size} frames in {np.unique(dealt.sequence).size} sequence(s)"
         )
-    return Split(kind, seed, purpose, roles)
+    return Split(kind, seed, purpose, roles, blocks)
 
 
 def default_kind(dataset: PoseDataset, purpose: Purpose = "training") -> SplitKind:
@@ -260,26 +289,42 @@ def _random(
 
 def _block(
     dataset: PoseDataset, generator: np.random.Generator, shares: Mapping[str, float]
+) -> tuple[dict[str, Indices], Blocks]:
+    surviving = 0
+    for least in (_ENOUGH, 1):
+        for count, gap in _BLOCKS:
+            roles = _in_blocks(dataset, generator, shares, count, gap)
+            sizes = [indices.size for indices in roles.values()]
+            surviving = sum(sizes)
+            if surviving >= _LEAST_SURVIVING * len(dataset) and min(sizes) >= least:
+                return roles, Blocks(count, gap)
+    raise UsageError(
+        f"split block: expected at least {_LEAST_SURVIVING:.0%} of the frames to remain after gaps "
+        f"of {_BLOCKS[-1][1]} frames, found {surviving} of {len(dataset)}; the recording is too "
+        "short; --split random assigns single frames"
+    )
+
+
+def _in_blocks(
+    dataset: PoseDataset,
+    generator: np.random.Generator,
+    shares: Mapping[str, float],
+    count: int,
+    gap: int,
 ) -> dict[str, Indices]:
+    """Deal about ``count`` blocks; drop the last and first frames where neighbours differ."""
     blocks: list[Indices] = []
     for number in range(len(dataset.sequence_names)):
         frames = np.flatnonzero(dataset.sequence == number)
-        pieces = max(1, round(_BLOCKS * frames.size / len(dataset)))
+        pieces = max(1, round(count * frames.size / len(dataset)))
         blocks += [block for block in np.array_split(frames, pieces) if block.size]
     dealt = _deal(generator.permutation(len(blocks)), _counts(len(blocks), shares))
     role_of = {int(block): role for role, members in dealt.items() for block in members}
     roles: dict[str, list[Indices]] = {role: [] for role in shares}
     for index, block in enumerate(blocks):
-        start = _GAP_AFTER if _border(dataset, blocks, role_of, index - 1) else 0
-        stop = block.size - (_GAP_BEFORE if _border(dataset, blocks, role_of, index) else 0)
+        start = gap - gap // 2 if _border(dataset, blocks, role_of, index - 1) else 0
+        stop = block.size - (gap // 2 if _border(dataset, blocks, role_of, index) else 0)
         roles[role_of[index]].append(block[start : max(start, stop)])
-    surviving = sum(part.size for parts in roles.values() for part in parts)
-    if surviving < _LEAST_SURVIVING * len(dataset):
-        raise UsageError(
-            f"split block: expected at least {_LEAST_SURVIVING:.0%} of the frames to remain after "
-            f"the gaps, found {surviving} of {len(dataset)}; the recording is too short; --split "
-            "random assigns single frames"
-        )
     empty = np.empty(0, np.int64)
     return {role: np.concatenate(parts) if parts else empty for role, parts in roles.items()}
 
