@@ -30,6 +30,8 @@ class _Options(NamedTuple):
     width: int = 320
     height: int = 240
     seed: int = 0
+    turn: int = 0
+    still: tuple[str, ...] = ()
 
 
 def open_room(spec: str = "room") -> PoseDataset:
@@ -39,9 +41,10 @@ def open_room(spec: str = "room") -> PoseDataset:
     ----------
     spec
         ``room``, then any of ``,flights=48`` (1..1000), ``,frames=50`` (per flight, 1..10000),
-        ``,size=320x240`` (64x48..1920x1080) and ``,seed=0`` (0..4294967295). Frame j of flight i
-        depends only on the size, the seed, i and j, so more flights or frames do not change the
-        earlier ones.
+        ``,size=320x240`` (64x48..1920x1080) and ``,seed=0`` (0..4294967295). ``,turn=1`` lets the
+        camera turn round and round; ``,still=z+pitch+roll`` holds any of x y z yaw pitch roll, here
+        those of a wheeled robot. Frame j of flight i depends only on these, the size, the seed, i
+        and j, so more flights or frames do not change the earlier ones.
 
     Returns
     -------
@@ -57,7 +60,11 @@ def open_room(spec: str = "room") -> PoseDataset:
     options = _parse(spec)
     fx = _FOCAL_PER_WIDTH * options.width
     intrinsics = Intrinsics(fx, fx, (options.width - 1) / 2, (options.height - 1) / 2)
-    flights = [_Flight(options.seed, number) for number in range(options.flights)]
+    still = [_NAMES.index(name) for name in options.still]
+    flights = [
+        _Flight(options.seed, number, bool(options.turn), still)
+        for number in range(options.flights)
+    ]
     times_s = np.arange(options.frames, dtype=np.float64) * _FRAME_TIME_S
     names = tuple(f"flight-{number:02d}" for number in range(1, options.flights + 1))
 
@@ -82,16 +89,24 @@ def _parse(spec: str) -> _Options:
     if name != "room":
         raise UsageError(f"expected a synthetic scene named room, found {name!r} in {spec!r}")
     values: dict[str, int] = {}
+    still: tuple[str, ...] = ()
     for item in items:
         key, _, text = item.partition("=")
         if key == "size":
             width, _, height = text.partition("x")
             found = {"width": width, "height": height}
-        elif key in ("flights", "frames", "seed"):
+        elif key in ("flights", "frames", "seed", "turn"):
             found = {key: text}
+        elif key == "still" and not still:
+            still, found = tuple(text.split("+")), {}
+            if not set(still) <= set(_NAMES):
+                raise UsageError(
+                    f"expected still= with names among {'+'.join(_NAMES)}, found {item!r}"
+                )
         else:
             raise UsageError(
-                f"expected an option flights=, frames=, size= or seed=, found {item!r} in {spec!r}"
+                "expected an option flights=, frames=, size=, seed=, turn= or still= once, found "
+                f"{item!r} in {spec!r}"
             )
         for field, digits in found.items():
             if field in values:
@@ -100,7 +115,7 @@ def _parse(spec: str) -> _Options:
             if not (digits.isascii() and digits.isdigit() and low <= int(digits) <= high):
                 raise UsageError(f"expected {_EXPECTED[key]}, found {item!r} in {spec!r}")
             values[field] = int(digits)
-    return _Options(**values)
+    return _Options(**values, still=still)
 
 
 _RANGES = {
@@ -109,12 +124,14 @@ _RANGES = {
     "width": (64, 1920),
     "height": (48, 1080),
     "seed": (0, 2**32 - 1),
+    "turn": (0, 1),
 }
 _EXPECTED = {
     "flights": "flights=1..1000",
     "frames": "frames=1..10000",
     "size": "size=WIDTHxHEIGHT between 64x48 and 1920x1080",
     "seed": "seed=0..4294967295",
+    "turn": "turn=0..1",
 }
 
 # ------------------------------------------------------------------------------------- flights
@@ -127,6 +144,10 @@ _EXPOSURE_S = 1 / 200
 # volume is small enough for a small network to learn; the speed is that of a hand-held camera.
 _CENTRE = np.array([0.0, -0.4, 1.3, 0.0, 0.0, 0.0])  # x y z in metres; yaw pitch roll in radians
 _REACH = np.array([0.4, 0.3, 0.15, *np.radians([17.5, 7.5, 4.0])])
+_NAMES = ("x", "y", "z", "yaw", "pitch", "roll")
+# Of a camera that turns round, in rad/s, either way.
+_TURN_RAD_S = 0.6, 1.2
+_TURN_STREAM = 2**20
 _TURNS = {3: np.array([0, 0, 1]), 4: np.array([1, 0, 0]), 5: np.array([0, 0, 1])}
 _LEVEL = quaternion_exp([-math.pi / 2, 0, 0])  # looks along world y, with z up in the image
 _SHARES = np.array([0.5, 0.35, 0.15])
@@ -136,8 +157,13 @@ _RATES_RAD_S = np.array([1.28, 2.72, 4.8])
 class _Flight:
     """One camera trajectory over continuous time, its light and its sensor noise."""
 
-    def __init__(self, seed: int, number: int) -> None:
+    def __init__(self, seed: int, number: int, turns: bool, still: list[int]) -> None:
         self._entropy = (seed, number)
+        self._still = still
+        # Start and rate of the turns, from a stream of their own.
+        around = self._rng(_TURN_STREAM)
+        rate = around.uniform(*_TURN_RAD_S) * around.choice([-1.0, 1.0])
+        self._yaw = (around.uniform(0.0, 2 * math.pi), rate) if turns else (0.0, 0.0)
         rng = self._rng(0)
         self._rate = _RATES_RAD_S * rng.uniform(0.8, 1.25, (6, 3))
         self._phase = rng.uniform(0, 2 * math.pi, (6, 3))
@@ -150,6 +176,8 @@ class _Flight:
         """Return ``T_world_camera`` at n times, shape (n, 7): tx ty tz, qx qy qz qw."""
         angles = self._rate * times_s[:, None, None] + self._phase
         state = _CENTRE + _REACH * (np.sin(angles) @ _SHARES)
+        state[:, self._still] = _CENTRE[self._still]
+        state[:, 3] += self._yaw[0] + self._yaw[1] * times_s
         yaw, pitch, roll = (quaternion_exp(state[:, [k]] * axis) for k, axis in _TURNS.items())
         # Right to left: roll about the optical axis, pitch about the camera's x axis (positive
         # looks up), the level camera looking along world y, yaw about world z.
