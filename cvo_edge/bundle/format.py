@@ -102,6 +102,9 @@ class PreprocessSpec(_Strict, frozen=True):
     in_graph: tuple[Literal["cast"], Literal["transpose"], Literal["normalise"]]
 
 
+StillDof = Literal["tx", "ty", "tz", "rx", "ry", "rz"]
+
+
 class PoseLimits(_Strict, frozen=True):
     """Lowest and highest plausible value per DoF; poses outside them are invalid.
 
@@ -120,6 +123,9 @@ class PoseSpec(_Strict, frozen=True, omit_defaults=True):
     ``origin_m``: the world position that the model's outputs, the limits and the method's
     parameters are relative to; null means the world's own origin. Positions far from it would lose
     centimetres in float32. ``Odometer`` adds it in float64, so its estimates are world coordinates.
+
+    ``still``: the degrees of freedom that hardly moved in training, e.g. the height of a wheeled
+    robot. Their ``standard_deviation`` is a floor, and scores leave them out.
     """
 
     target: Literal["absolute"]
@@ -131,6 +137,7 @@ class PoseSpec(_Strict, frozen=True, omit_defaults=True):
     limits: PoseLimits
     standard_deviation: SixPositive
     origin_m: Position | None = None
+    still: tuple[StillDof, ...] = ()
 
 
 class LeftOut(_Strict, frozen=True):

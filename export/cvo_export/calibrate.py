@@ -48,6 +48,7 @@ from cvo_export.bundles.draft import (
     plausible,
     six,
     versions,
+    with_any_rotation,
 )
 from cvo_export.bundles.rule import chosen_rule
 from cvo_export.bundles.thresholds import calibrated
@@ -60,7 +61,6 @@ from cvo_export.vocabulary import GivenRotation
 Array = NDArray[np.float64]
 
 _FORMS = ({"pose": (1, 7)}, {"pose": (1, 7), "lower": (1, 6), "upper": (1, 6)})
-_FULL_TURN = float(np.pi)
 _LEAST_INPUT = 16
 _PACKAGES = ("cvo-edge", "cvo-export", "onnx", "onnxruntime", "numpy")
 
@@ -258,7 +258,7 @@ def _from_model(
         )
     reference, limits, deviation = known_space(about(dataset.poses[split.roles["val"]], origin_m))
     if rotation == "euler_zyx" or reference is None:
-        reference, limits = None, _with_any_rotation(limits)
+        reference, limits = None, with_any_rotation(limits)
     return Draft(
         name=name,
         method="cqr",
@@ -306,21 +306,13 @@ def _fields(tensor: TensorSpec) -> dict[str, object]:
     return {"name": tensor.name, "dtype": tensor.dtype, "shape": tensor.shape}
 
 
-def _with_any_rotation(limits: PoseLimits) -> PoseLimits:
-    """Keep the limits of the position; any rotation is plausible."""
-    return PoseLimits(
-        lowest=(*limits.lowest[:3], *(-_FULL_TURN,) * 3),
-        highest=(*limits.highest[:3], *(_FULL_TURN,) * 3),
-    )
-
-
 def _with_wider_limits(draft: Draft, poses: Array) -> Draft:
     """Widen a bundle's limits to include the poses (n, 7) of the new data."""
     pose = draft.pose
     poses = about(poses, pose.origin_m)
     if pose.reference_q_xyzw is None:
         coordinates = known_coordinates(poses, mean_rotation(poses[:, 3:]))
-        found = _with_any_rotation(plausible(coordinates, FEW_POSES_MARGIN))
+        found = with_any_rotation(plausible(coordinates, FEW_POSES_MARGIN))
     else:
         coordinates = known_coordinates(poses, np.array(pose.reference_q_xyzw))
         found = plausible(coordinates, FEW_POSES_MARGIN)

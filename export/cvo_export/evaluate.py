@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration, LeftOut
+from cvo_edge.bundle.format import Calibration, LeftOut, StillDof
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import GateError, UsageError
 from cvo_edge.guarantee import by_level, left_out_text
 from cvo_edge.heads import HEADS
 from cvo_edge.odometer import Odometer
+from cvo_export.bundles.draft import still_text
 from cvo_export.bundles.figures import Claim, Sets, point_error
 from cvo_export.bundles.observed import observe
 from cvo_export.bundles.online import Schedule, Stage, online, online_lines
@@ -119,6 +120,7 @@ def evaluate(
             "n_calibration": calibration.calibration.n,
             # If true, the subset "all" may include frames that the network was trained on.
             "named_as_training_data": dataset.name == calibration.provenance.dataset,
+            "still": list(calibration.pose.still),
             "point_error": point_error(seen),
             "own": sets.own(),
             "levels": levels,
@@ -191,6 +193,8 @@ def table(report: Mapping[str, Any]) -> list[str]:
         f"90 % {100 * error['p90_m']:.2f} cm {error['p90_deg']:.2f} deg, "
         f"99 % {100 * error['p99_m']:.2f} cm {error['p99_deg']:.2f} deg",
     ]
+    if report["still"]:
+        lines.append(still_text(report["still"]))
     if report["noise"] is not None:
         noise = Noise(report["noise"]["name"], report["noise"]["strength"])
         lines.append(f"noise {noise} ({noise.unit}), seed {report['noise']['seed']}")
@@ -207,16 +211,16 @@ def table(report: Mapping[str, Any]) -> list[str]:
             f"{own['joint_coverage']:.3f}, score {own['normalised_interval_score']:.3f}"
         )
     if report["noise"] is None:
-        lines += ["", *_level_lines(report["method"], report["rule"], report["levels"])]
+        lines += ["", *_level_lines(report, report["rule"], report["levels"])]
         if "other_rule" in report:
             other = report["other_rule"]
-            lines += ["", *_level_lines(report["method"], other["rule"], other["levels"])]
+            lines += ["", *_level_lines(report, other["rule"], other["levels"])]
         lines += _sequence_lines(report["sequences"])
         return [*lines, "", *online_lines(report["online"])] if "online" in report else lines
     lines += [
         "",
         f"clean: the bundle's own thresholds, from {report['n_calibration']} frames without noise",
-        *_level_lines(report["method"], report["rule"], report["levels"], _NO_CLAIM),
+        *_level_lines(report, report["rule"], report["levels"], _NO_CLAIM),
         *_sequence_lines(report["sequences"]),
         "",
     ]
@@ -227,7 +231,7 @@ def table(report: Mapping[str, Any]) -> list[str]:
         *lines,
         f"recalibrated: thresholds from {again['n_calibration']} calibration frames with the same "
         f"noise; {again['left_out']} left out",
-        *_level_lines(report["method"], report["rule"], again["levels"]),
+        *_level_lines(report, report["rule"], again["levels"]),
         *_sequence_lines(again["sequences"]),
     ]
 
@@ -239,8 +243,16 @@ def _bounded(levels: list[dict[str, Any]], frames: int) -> int:
 
 
 def _level_lines(
-    method: str, rule: str, levels: list[dict[str, Any]], footnote: str = _INDICATIVE
+    report: Mapping[str, Any],
+    rule: str,
+    levels: list[dict[str, Any]],
+    footnote: str = _INDICATIVE,
 ) -> list[str]:
+    names = get_args(StillDof)
+    kinds = [
+        [dof for dof in kind if names[dof] not in report["still"]] or kind
+        for kind in ([0, 1, 2], [3, 4, 5])
+    ]
     lines = [
         f"{rule + ' rule':<20}{'coverage: tx ty tz, three rotations':^42}{'joint':>7}"
         f"{'99 % band':>16}{'width cm':>10}{'deg':>7}{'score':>8}",
@@ -253,12 +265,12 @@ def _level_lines(
         width = np.array(level["median_width"])
         lines.append(
             f"{level['confidence']:<8g}{level['scope']:<12}{coverage}"
-            f"{level['joint_coverage']:>7.3f}{shown:>16}{100 * width[:3].mean():>10.2f}"
-            f"{np.rad2deg(width[3:].mean()):>7.2f}{level['normalised_interval_score']:>8.3f}"
+            f"{level['joint_coverage']:>7.3f}{shown:>16}{100 * width[kinds[0]].mean():>10.2f}"
+            f"{np.rad2deg(width[kinds[1]].mean()):>7.2f}{level['normalised_interval_score']:>8.3f}"
         )
     for level in levels:
         if level["confidence"] == 0.9 and "disjoint_share" in level:
-            own = HEADS[method].figures_text(level)
+            own = HEADS[report["method"]].figures_text(level)
             lines.append(
                 f"{level['confidence']:<8g}{level['scope']:<12}{own + ', ' if own else ''}"
                 f"disjoint {100 * np.mean(level['disjoint_share']):.1f} % of sets, "

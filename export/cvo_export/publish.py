@@ -30,6 +30,7 @@ from cvo_export.bundles.draft import (
     plausible,
     six,
     versions,
+    with_any_rotation,
 )
 from cvo_export.bundles.rule import chosen_rule
 from cvo_export.bundles.thresholds import calibrated
@@ -51,6 +52,8 @@ _PACKAGES = ("cvo-edge", "cvo-export", "torch", "timm", "onnx", "onnxruntime", "
 _PARITY_FRAMES = 32
 # Frames that give the value ranges of the feature maps for quantisation.
 _RANGE_FRAMES = 128
+# Limits of a degree of freedom that stands still, in units of its floor on either side.
+_STILL_MARGIN = 10.0
 
 
 def publish(
@@ -231,6 +234,9 @@ def _draft(
     model = model_spec(model_bytes, OPSET, provider)
     # The score's unit and the limits.
     known = target.coordinates(run.dataset.local_poses[run.training_frames])
+    limits = plausible(known, np.where(target.still, _STILL_MARGIN * target.deviation, 0.0))
+    if target.turns:
+        limits = with_any_rotation(limits)
     return Draft(
         name=name,
         method=run.graph.head.runtime_method,
@@ -251,10 +257,11 @@ def _draft(
             frame_id=WORLD_FRAME,
             child_frame_id=CAMERA_FRAME,
             rotation=run.graph.head.rotation,
-            reference_q_xyzw=four(target.reference_q_xyzw),
+            reference_q_xyzw=None if target.turns else four(target.reference_q_xyzw),
             units=("m", "rad"),
-            limits=plausible(known),
-            standard_deviation=six(known.std(axis=0)),
+            limits=limits,
+            standard_deviation=six(np.where(target.still, target.deviation, known.std(axis=0))),
+            still=target.still_dof,
             origin_m=run.dataset.origin_m,
         ),
         provenance=Provenance(

@@ -36,7 +36,7 @@ from cvo_export.training.run import load_run
 from .conftest import ignore_progress, tiny_config
 from .test_train import InterruptedTrainingError, same_weights, stopping_after
 
-SETTING = Setting(7, Target(np.array([0.0, 0, 0, 1]), np.zeros(6), np.ones(6)), 3)
+SETTING = Setting(7, Target.of_arrays([np.array([0.0, 0, 0, 1]), np.zeros(6), np.ones(6)]), 3)
 Z = norm.ppf(0.95)
 
 

@@ -439,7 +439,7 @@ def test_more_components_than_there_are_is_refused_before_any_lesson(tmp_path, m
 def test_the_mean_of_many_passes_is_the_network_itself():
     # Dropout is before a linear layer, so its expectation is the deterministic output.
     torch.manual_seed(0)
-    network = PointNetwork(30, (16, 12), 0.1, dropout=0.3).eval()
+    network = PointNetwork(30, 6, (16, 12), 0.1, dropout=0.3).eval()
     features = torch.randn(5, 30)
     with torch.no_grad():
         drawn = network.passes(features, 4000, torch.Generator().manual_seed(1))

@@ -22,6 +22,7 @@ from cvo_edge.programs.selftest import check_selftest
 from cvo_export.bundles.observed import observe
 from cvo_export.graph.to_onnx import check_parity, export_onnx
 from cvo_export.networks.heads.cjp import CjpConfig, CjpLearner, CjpNetwork, CjpPrediction
+from cvo_export.networks.standardised import Target
 from cvo_export.publish import publish
 from cvo_export.training import run as runs
 from cvo_export.training.loop import train
@@ -167,11 +168,11 @@ def test_codebook_latent_needs_the_image_alone(tmp_path):
 def test_several_members_answer_with_their_mean(latent):
     torch.manual_seed(0)
     config = CjpConfig(latent_size=4, hidden=(16, 8), members=3, latent=latent)
-    network = CjpNetwork(20, config).eval()
+    network = CjpNetwork(20, config, 6).eval()
     features = torch.randn(5, 20)
     each = []
     for member in network.members:
-        alone = CjpNetwork(20, msgspec.structs.replace(config, members=1)).eval()
+        alone = CjpNetwork(20, msgspec.structs.replace(config, members=1), 6).eval()
         alone.members[0] = member
         each.append(alone(features))
     assert not torch.allclose(each[0][0], each[1][0])
@@ -182,7 +183,8 @@ def test_several_members_answer_with_their_mean(latent):
 def test_members_learn_beside_each_other_as_if_alone():
     torch.manual_seed(0)
     config = CjpConfig(latent_size=4, hidden=(16, 8), members=2)
-    learner = CjpLearner(20, config).train()
+    target = Target.of_arrays([np.array([0.0, 0, 0, 1]), np.zeros(6), np.ones(6)])
+    learner = CjpLearner(20, config, target).train()
     features, y = torch.randn(8, 20), torch.randn(8, 6)
     first, second = learner.network.members
     second.load_state_dict(first.state_dict())

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from cvo_edge.errors import SinkError, UsageError
-from cvo_export.networks.standardised import MAX_SPREAD_RAD, fit_target
+from cvo_export.networks.baselines.split import SplitConfig
+from cvo_export.networks.standardised import MAX_SPREAD_RAD
 from cvo_export.training import features
 from cvo_export.training.features import ModelImages
 from cvo_export.training.loop import train
@@ -127,19 +128,12 @@ def test_the_papers_choices_train(tmp_path, latent):
     assert np.isfinite(run.history[-1].loss)
 
 
-def test_rotations_too_wide_for_one_tangent_are_refused():
-    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-    poses = np.zeros((40, 7))
-    poses[:, :3] = np.random.default_rng(0).standard_normal((40, 3))
-    poses[:, 5], poses[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
-    with pytest.raises(UsageError, match=f"{MAX_SPREAD_RAD:g} rad"):
-        fit_target(poses)
-
-
-def test_a_degree_of_freedom_that_never_moves_is_refused():
-    poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (10, 1))
-    with pytest.raises(UsageError, match="motion in every degree of freedom"):
-        fit_target(poses)
+def test_a_baseline_refuses_rotations_too_wide_for_one_chart(tmp_path):
+    turning = "synthetic:room,flights=20,frames=20,size=64x48,turn=1"
+    config = tiny_config(dataset=turning, head=SplitConfig())
+    with pytest.raises(UsageError, match=f"within {MAX_SPREAD_RAD:g} rad of their mean for"):
+        train(tmp_path / "run", config, ignore_progress)
+    assert not (tmp_path / "run").exists()
 
 
 def test_too_few_frames_of_val_to_decide_anything_are_refused(tmp_path):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cvo_edge.bundle.format import PoseSpec, Threshold
 from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_edge.heads import Candidate, Head
+from cvo_edge.pose import Chart
 from cvo_export.bundles.difficulty import fitted_difficulty
 from cvo_export.bundles.draft import Draft
 from cvo_export.bundles.entries import entry_of, marginal_thresholds
@@ -32,7 +33,8 @@ def chosen(draft: Draft, val: Observed, candidates: Sequence[Candidate]) -> Cand
     """Return the candidate to use: the first, unless another is clearly better on val.
 
     Candidates are compared by the interval score at 0.9 over each DoF's standard deviation, with
-    thresholds from val itself; val is too small to separate closer candidates.
+    thresholds from val itself; val is too small to separate closer candidates. Degrees of freedom
+    that stand still do not count.
     """
     heads = [draft.head(candidate) for candidate in candidates]
     results = [_loss(draft, head, _threshold(head, val), val) for head in heads]
@@ -92,7 +94,15 @@ def _loss(draft: Draft, head: Head, entry: Threshold, frames: Observed) -> float
     width = np.array([each.width() for each in sets])
     distance = np.array([each.distance(y) for each, y in zip(sets, frames.truth, strict=True)])
     deviation = np.array(draft.pose.standard_deviation)
-    return float((interval_score(width, distance, 1.0 - _LEVEL) / deviation).mean())
+    score = interval_score(width, distance, 1.0 - _LEVEL) / deviation
+    return float(score[:, moving(draft.pose)].mean())
+
+
+def moving(pose: PoseSpec) -> NDArray[np.bool_]:
+    """Return which degrees of freedom scores are about, (6,): those that moved, or all if none."""
+    names = Chart(pose.rotation).dof
+    moves = np.array([name not in pose.still for name in names])
+    return moves if moves.any() else ~moves
 
 
 def workspace(pose: PoseSpec) -> tuple[Array, Array]:

@@ -53,6 +53,7 @@ MAX_SPREAD_RAD = 2.0
 # Least half-width in the normalised score, in standard deviations of each DoF.
 HALF_WIDTH_FLOOR = 0.01
 _LEAST_DEVIATION = 1e-6
+_FULL_TURN = float(np.pi)
 
 # Margin of plausible poses around the known ones, as a share of each DoF's range.
 _LIMIT_MARGIN = 0.5
@@ -266,15 +267,28 @@ def known_space(
     )
 
 
-def plausible(coordinates: Array, least_margin: float = 0.0) -> PoseLimits:
+def plausible(coordinates: Array, least_margin: float | Array = 0.0) -> PoseLimits:
     """Return limits half a range beyond the known poses (n, 6) on each side.
 
-    The margin is at least ``least_margin``, in metres and radians, because a few poses cover only
-    part of where a camera goes.
+    The margin is at least ``least_margin``, in metres and radians, a number or (6,), because a few
+    poses cover only part of where a camera goes.
     """
     lowest, highest = coordinates.min(axis=0), coordinates.max(axis=0)
     margin = np.maximum(_LIMIT_MARGIN * (highest - lowest), least_margin)
     return PoseLimits(lowest=six(lowest - margin), highest=six(highest + margin))
+
+
+def with_any_rotation(limits: PoseLimits) -> PoseLimits:
+    """Keep the limits of the position; any rotation is plausible."""
+    return PoseLimits(
+        lowest=(*limits.lowest[:3], *(-_FULL_TURN,) * 3),
+        highest=(*limits.highest[:3], *(_FULL_TURN,) * 3),
+    )
+
+
+def still_text(still: Sequence[str]) -> str:
+    """Say which degrees of freedom hardly moved in training, and what leaves them out."""
+    return f"{' '.join(still)} hardly moved in training: scores and mean widths leave them out"
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:

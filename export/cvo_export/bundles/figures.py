@@ -17,7 +17,7 @@ from cvo_edge.conformal import conformal_rank, interval_score
 from cvo_edge.guarantee import statement
 from cvo_edge.odometer import Odometer
 from cvo_edge.sets import ConformalSet
-from cvo_export.bundles.choice import workspace
+from cvo_export.bundles.choice import moving, workspace
 from cvo_export.bundles.observed import Observed
 from cvo_export.bundles.thresholds import effective_frames
 from cvo_export.bundles.volume import ellipsoids_log_volume
@@ -190,18 +190,20 @@ class Sets:
     def widths(self, sets: list[ConformalSet], alpha: float) -> dict[str, Any]:
         """Return widths and interval scores (6,) of bounded sets, and the standardised score.
 
-        The standardised score is the mean over the DoF of interval score / standard deviation.
+        The standardised score is the mean over the DoF that move of interval score / standard
+        deviation.
         """
         width = np.array([each.width() for each in sets])
         distance = np.array(
             [each.distance(y) for each, y in zip(sets, self.seen.truth, strict=True)]
         )
         score = interval_score(width, distance, alpha).mean(axis=0)
+        moves = moving(self.calibration.pose)
         return {
             "mean_width": width.mean(axis=0).tolist(),
             "median_width": np.median(width, axis=0).tolist(),
             "interval_score": score.tolist(),
-            "normalised_interval_score": float((score / self.deviation).mean()),
+            "normalised_interval_score": float((score / self.deviation)[moves].mean()),
         }
 
     def adaptiveness(self, sets: list[ConformalSet]) -> dict[str, float | None]:

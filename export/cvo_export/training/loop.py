@@ -19,6 +19,7 @@ from torch import Tensor
 
 from cvo_edge.camera import Camera
 from cvo_edge.errors import UsageError
+from cvo_export.bundles.draft import MAX_SPREAD_RAD
 from cvo_export.data.place import Place
 from cvo_export.data.sparse_map import SparseMap, read_sparse_map, sparse_map, write_sparse_map
 from cvo_export.data.splits import (
@@ -34,7 +35,7 @@ from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.networks.heads import Setting
 from cvo_export.networks.heads.base import Examples, L, Schedule
 from cvo_export.networks.methods import TRAINABLE
-from cvo_export.networks.standardised import fit_target
+from cvo_export.networks.standardised import Target, fit_target
 from cvo_export.networks.stem import Upper
 from cvo_export.progress import Progress
 from cvo_export.training.features import (
@@ -81,6 +82,7 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     backbone, upper, weights_sha256 = loaded_backbone(config, config.weights)
     indices, n_train = _training_frames(config, dataset, split)
     target = fit_target(dataset.local_poses[indices])
+    _check_turns(config, target)
     claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
     images = ModelImages(dataset, indices, *size)
@@ -114,6 +116,16 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     run = Run(config, dataset, split, target, graph, weights_sha256, trainer.history, tuple(folds))
     run.save(run_dir)
     return run
+
+
+def _check_turns(config: TrainConfig, target: Target) -> None:
+    """Raise UsageError if the rotations need a method that learns any rotation."""
+    if target.turns and not TRAINABLE[config.method].turns:
+        known = ", ".join(name for name, method in TRAINABLE.items() if method.turns)
+        raise UsageError(
+            f"poses: expected rotations within {MAX_SPREAD_RAD:g} rad of their mean for the method "
+            f"{config.method}, found wider ones; these methods learn any rotation: {known}"
+        )
 
 
 def check_roles(config: TrainConfig, dataset: PoseDataset) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.files import whole_file, write_whole
 from cvo_edge.vocabulary import Crop, SplitKind
+from cvo_export.bundles.draft import still_text
 from cvo_export.data.augment import AugmentConfig
 from cvo_export.data.splits import (
     Indices,
@@ -190,11 +191,10 @@ class Run:
 
     def save(self, run_dir: Path) -> None:
         """Write the result of training atomically; raises SinkError."""
-        target = (self.target.reference_q_xyzw, self.target.mean, self.target.std)
         content = {
             "backbone": self.graph.backbone.state_dict(),
             "head": self.graph.head.state_dict(),
-            "target": [torch.from_numpy(values) for values in target],
+            "target": [torch.from_numpy(values) for values in self.target.arrays()],
             "weights_sha256": self.weights_sha256,
             "history": [tuple(entry) for entry in self.history],
             "folds": [head.state_dict() for head in self.folds],
@@ -220,8 +220,15 @@ class Run:
         counts = ", ".join(f"{role} {size}" for role, size in sizes.items())
         best = self.best
         parameters = sum(parameter.numel() for parameter in self.graph.parameters())
+        lines = [f"split       {self.split.kind}: {counts}"]
+        if self.split.blocks is not None and self.split.blocks.cost is not None:
+            lines.append(f"            {self.split.blocks.cost}")
+        if self.target.turns:
+            lines.append("rotation    any: bounds are offsets from each prediction")
+        if self.target.still_dof:
+            lines.append(f"still       {still_text(self.target.still_dof)}")
         return [
-            f"split       {self.split.kind}: {counts}",
+            *lines,
             f"network     {self.config.backbone.name}, {parameters / 1e6:.2f} M parameters",
             f"best        val score {best.val_score:.3f} at step {best.step} ({best.lesson})",
         ]
@@ -297,7 +304,7 @@ def load_run(run_dir: Path, dataset: str | None = None) -> Run:
         raise UsageError(f"{run_dir}: cannot read the files of the run: {line}") from None
     opened = open_dataset(dataset or config.dataset)
     split = same_split(opened, recorded)
-    target = Target(*(values.numpy() for values in stored["target"]))
+    target = Target.of_arrays([values.numpy() for values in stored["target"]])
     backbone, upper, _ = loaded_backbone(config, NO_WEIGHTS)
     setting = Setting(backbone.size, target, config.seed, upper)
     restore = TRAINABLE[config.method].restore

@@ -80,8 +80,7 @@ class IntervalHead(ExportedHead):
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return pose, lower and upper."""
-        point, lower, upper = (self.decoder(values) for values in self.network(features))
-        return self.decoder.pose(point), lower, upper
+        return self.decoder.interval(*self.network(features))
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Put the normalised score first: its factors transfer to harder or easier recordings."""

@@ -46,13 +46,15 @@ class SplitHead(ExportedHead):
 def _train(lessons: Lessons, config: SplitConfig) -> SplitHead:
     size = lessons.setting.feature_size
     learner = lessons.learn(
-        "split", lambda: PointLearner(size, config.hidden, config.feature_noise)
+        "split",
+        lambda: PointLearner(size, lessons.setting.target, config.hidden, config.feature_noise),
     )
     return SplitHead(learner.network, lessons.setting)
 
 
 def _restore(setting: Setting, config: SplitConfig, state: Mapping[str, Tensor]) -> SplitHead:
-    network = PointNetwork(setting.feature_size, config.hidden, config.feature_noise)
+    size = setting.feature_size, setting.target.size
+    network = PointNetwork(*size, config.hidden, config.feature_noise)
     head = SplitHead(network, setting)
     head.load_state_dict(state)
     return head

@@ -95,11 +95,11 @@ class Learner(nn.Module):
 
     @abstractmethod
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
-        """Features (n, size), standardised truth (n, 6) -> scalar."""
+        """Features (n, size), standardised truth (n, 6) or (n, 9) -> scalar."""
 
     @abstractmethod
     def val_score(self, features: Tensor, y: Array) -> float:
-        """Return the val score: mean interval score at 90 %, on standardised numbers (n, 6).
+        """Return the val score: mean interval score at 90 % for standardised truths (n, 6 or 9).
 
         It is close to the figure that judges the bundle, but its thresholds come from val itself.
         """
@@ -266,7 +266,7 @@ class Method:
     ``restore`` rebuilds a head from its state dict, given the setting and options of its training.
     ``cells``: whether the head reads the map of a stem and trains the stages after it. ``copies``,
     ``steps`` and ``augment`` are the defaults of a run; with cells, large data sets get fewer
-    copies.
+    copies. ``turns``: whether it learns targets of nine numbers, for rotations of any size.
     """
 
     config: type[Struct]
@@ -276,6 +276,7 @@ class Method:
     copies: int = 48
     steps: int = 10_000
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    turns: bool = False
 
 
 def interval_candidates(parameters: Struct) -> tuple[Candidate, ...]:
@@ -285,4 +286,4 @@ def interval_candidates(parameters: Struct) -> tuple[Candidate, ...]:
 
 def half_width_floor(target: Target) -> Six:
     """Return the least half-width per DoF for the normalised score, from the poses' deviation."""
-    return six(HALF_WIDTH_FLOOR * target.std)
+    return six(HALF_WIDTH_FLOOR * target.deviation)

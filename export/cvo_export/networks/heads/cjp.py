@@ -40,7 +40,7 @@ from cvo_export.networks.losses import (
     interval_score_loss,
     kl_divergence,
 )
-from cvo_export.networks.standardised import PoseDecoder
+from cvo_export.networks.standardised import PoseDecoder, Target
 
 Array = NDArray[np.float64]
 Latent = Literal["mean", "codebook", "sample"]
@@ -116,7 +116,11 @@ class CjpConfig(Struct, frozen=True, tag="cjp", tag_field="method", forbid_unkno
 
 
 class CjpPrediction(NamedTuple):
-    """Standardised point and bounds (n, 6), and the latent Gaussian (n, latent_size)."""
+    """Standardised point and bounds, and the latent Gaussian (n, latent_size).
+
+    The point has the numbers of the target (n, 6) or (n, 9). Bounds (n, 6) are standardised
+    coordinates, or offsets from the point if the target turns.
+    """
 
     point: Tensor
     lower: Tensor
@@ -128,9 +132,10 @@ class CjpPrediction(NamedTuple):
 class CjpMember(nn.Module):
     """One variational network: standardised features (n, size) -> CjpPrediction."""
 
-    def __init__(self, size: int, config: CjpConfig) -> None:
+    def __init__(self, size: int, config: CjpConfig, outputs: int) -> None:
         super().__init__()
         self.free = config.bounds == "free"
+        self.sizes = [outputs, DOF, DOF]
         wide, narrow = config.hidden
         self.encoder = nn.Sequential(
             *dense(size, wide, config.dropout), *dense(wide, narrow, config.dropout)
@@ -140,7 +145,7 @@ class CjpMember(nn.Module):
         self.decoder = nn.Sequential(
             *dense(config.latent_size, narrow, config.dropout),
             *dense(narrow, wide, config.dropout),
-            nn.Linear(wide, 3 * DOF),
+            nn.Linear(wide, sum(self.sizes)),
         )
 
     def encode(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -150,11 +155,13 @@ class CjpMember(nn.Module):
         return self.mu(hidden), self.log_variance(hidden).clamp(-10.0, 10.0)
 
     def decode(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Latent (n, latent_size) -> point, lower, upper (n, 6), standardised."""
-        point, a, b = self.decoder(z).split(DOF, dim=1)
+        """Latent (n, latent_size) -> point, lower, upper, standardised."""
+        point, a, b = self.decoder(z).split(self.sizes, dim=1)
         if self.free:
             return point, torch.minimum(a, b), torch.maximum(a, b)
-        return point, point - softplus(a), point + softplus(b)
+        # A point of nine numbers has no sides: bounds are offsets from it.
+        centre = point if point.shape == a.shape else torch.zeros_like(a)
+        return point, centre - softplus(a), centre + softplus(b)
 
     def forward(self, x: Tensor, noise: Tensor | None = None) -> CjpPrediction:
         """Features (n, size), latent noise (n, latent_size); without noise, uses the mean."""
@@ -164,13 +171,18 @@ class CjpMember(nn.Module):
 
 
 class CjpNetwork(nn.Module):
-    """Features (n, size) -> standardised point, lower, upper (n, 6), averaged over the members."""
+    """Features (n, size) -> standardised point, lower, upper, averaged over the members.
 
-    def __init__(self, size: int, config: CjpConfig) -> None:
+    ``outputs``: numbers of the point, see ``CjpPrediction``.
+    """
+
+    def __init__(self, size: int, config: CjpConfig, outputs: int) -> None:
         super().__init__()
         self.config = config
         self.standardise = Standardise(size, config.feature_noise)
-        self.members = nn.ModuleList(CjpMember(size, config) for _ in range(config.members))
+        self.members = nn.ModuleList(
+            CjpMember(size, config, outputs) for _ in range(config.members)
+        )
         self.register_buffer("codebook", _codebook(config.latent_size))
         self.codebook: Tensor
 
@@ -212,7 +224,7 @@ class CjpNetwork(nn.Module):
         z = mu[:, None, :] + self.codebook * spread[:, None, :]
         decoded = member.decode(z.flatten(0, 1))
         point, lower, upper = (
-            values.reshape(-1, _CODEBOOK_SIZE, DOF).mean(dim=1) for values in decoded
+            values.reshape(-1, _CODEBOOK_SIZE, values.shape[1]).mean(dim=1) for values in decoded
         )
         return point, lower, upper
 
@@ -220,35 +232,42 @@ class CjpNetwork(nn.Module):
 class CjpLearner(Learner):
     """The network with the loss of Eq. 6: point + beta KL + INTSCORE + COMCAL, standardised."""
 
-    def __init__(self, size: int, config: CjpConfig) -> None:
+    def __init__(self, size: int, config: CjpConfig, target: Target) -> None:
         super().__init__()
         self.config = config
-        self.network = CjpNetwork(size, config)
+        self.decoder = PoseDecoder(target)
+        self.network = CjpNetwork(size, config, target.size)
         self.standardise = self.network.standardise
         self.combined_calibration = CombinedCalibrationLoss(DOF, config.sharpness, config.gate)
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
-        """Features (n, size), truth (n, 6) -> scalar; warm-up omits the calibration term."""
+        """Features (n, size), truth (n, k) -> scalar; warm-up omits the calibration term."""
         prediction = self.network.samples(features)
         return self.of_prediction(prediction, y.repeat(self.config.members, 1), warm_up)
 
     def of_prediction(self, prediction: CjpPrediction, y: Tensor, warm_up: bool) -> Tensor:
-        """Prediction and truth (n, 6) -> scalar."""
+        """Prediction and truth (n, k) -> scalar."""
         point, lower, upper, mu, log_variance = prediction
         error = point - y
+        bounded = self._bounded(point, y)
         loss = (
             (error.abs() if self.config.point_loss == "absolute" else error.square()).mean()
             + self.config.kl_weight * kl_divergence(mu, log_variance)
-            + interval_score_loss(lower, upper, y, self.config.interval_form)
+            + interval_score_loss(lower, upper, bounded, self.config.interval_form)
         )
         # Update running coverages during warm-up: they gate the calibration term afterwards.
-        combined = self.combined_calibration(lower, upper, y)
+        combined = self.combined_calibration(lower, upper, bounded)
         return loss if warm_up else loss + combined
 
     def val_score(self, features: Tensor, y: Array) -> float:
         """See ``Learner``; scores the network's own bounds with the additive score."""
-        _, lower, upper = self.network(features)
-        return conformalised_score(lower.double().numpy(), upper.double().numpy(), y)
+        point, lower, upper = self.network(features)
+        bounded = self._bounded(point, torch.from_numpy(y).float()).double().numpy()
+        return conformalised_score(lower.double().numpy(), upper.double().numpy(), bounded)
+
+    def _bounded(self, point: Tensor, y: Tensor) -> Tensor:
+        """Return what the bounds (n, 6) are about: the truth, or its offset from the point."""
+        return self.decoder.errors(point, y) if self.decoder.turns else y
 
 
 class CjpHead(ExportedHead):
@@ -261,6 +280,8 @@ class CjpHead(ExportedHead):
         super().__init__()
         self.network = network
         self.decoder = PoseDecoder(setting.target)
+        if setting.target.turns:
+            self.rotation = "tangent_predicted"
         config = network.config
         if config.latent == "sample":
             self.extra_inputs = {"latent_noise": torch.zeros((1, config.latent_size))}
@@ -275,8 +296,7 @@ class CjpHead(ExportedHead):
         self, features: Tensor, noise: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return pose, lower and upper in metres and radians."""
-        point, lower, upper = (self.decoder(values) for values in self.network(features, noise))
-        return self.decoder.pose(point), lower, upper
+        return self.decoder.interval(*self.network(features, noise))
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Put the normalised score first: its factors transfer to harder or easier recordings."""
@@ -285,17 +305,18 @@ class CjpHead(ExportedHead):
 
 def _train(lessons: Lessons, config: CjpConfig) -> CjpHead:
     setting = lessons.setting
-    learner = lessons.learn("cjp", lambda: CjpLearner(setting.feature_size, config))
+    learner = lessons.learn("cjp", lambda: CjpLearner(setting.feature_size, config, setting.target))
     return CjpHead(learner.network, setting)
 
 
 def _restore(setting: Setting, config: CjpConfig, state: Mapping[str, Tensor]) -> CjpHead:
-    head = CjpHead(CjpNetwork(setting.feature_size, config), setting)
+    network = CjpNetwork(setting.feature_size, config, setting.target.size)
+    head = CjpHead(network, setting)
     head.load_state_dict(state)
     return head
 
 
-METHOD = Method(CjpConfig, _train, _restore)
+METHOD = Method(CjpConfig, _train, _restore, turns=True)
 
 
 def _codebook(latent_size: int) -> Tensor:

@@ -123,7 +123,7 @@ class CqrHead(ExportedHead):
         )
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pose (n, 7) in metres and the forest's input (n, components + 6)."""
+        """Return pose (n, 7) in metres and the forest's input (n, components + 6 or 9)."""
         point = self.network(features)
         compressed = self.network.standardise(features) @ self.components
         pose = self.decoder.pose(self.decoder(point))
@@ -232,10 +232,11 @@ def _restore(setting: Setting, config: CqrConfig, state: Mapping[str, Tensor]) -
         Forest(**{name: state[f"forest{number}_{name}"].numpy() for name in forest_fields()})
         for number in range(count)
     ]
-    network = PointNetwork(setting.feature_size, config.hidden, config.feature_noise)
+    size = setting.feature_size, setting.target.size
+    network = PointNetwork(*size, config.hidden, config.feature_noise)
     head = CqrHead(network, state["components"], forests, setting, config)
     head.load_state_dict(state)
     return head
 
 
-METHOD = Method(CqrConfig, _train, _restore)
+METHOD = Method(CqrConfig, _train, _restore, turns=True)

@@ -2,13 +2,16 @@
 
 The paper's section III-B. Class edges are quantiles of the training poses, so that classes are
 narrow where poses are dense. A shared trunk outputs the logits of all six degrees of freedom.
+
+Where rotations spread too far for one chart, a point network predicts the rotation, and the classes
+of the three rotation coordinates divide its errors on frames that it has not seen.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +26,7 @@ from cvo_edge.heads import Candidate
 from cvo_edge.heads.csp import CspParameters, class_scores
 from cvo_export.networks.heads.base import (
     DOF,
+    Examples,
     ExportedHead,
     Learner,
     Lessons,
@@ -31,8 +35,15 @@ from cvo_export.networks.heads.base import (
     Standardise,
     dense,
 )
-from cvo_export.networks.heads.point import FeatureNoise, Hidden
-from cvo_export.networks.standardised import PoseDecoder
+from cvo_export.networks.heads.point import (
+    FeatureNoise,
+    Hidden,
+    PointNetwork,
+    Residuals,
+    learn_held_out,
+    residuals_of,
+)
+from cvo_export.networks.standardised import PoseDecoder, Target
 
 Array = NDArray[np.float64]
 
@@ -45,6 +56,8 @@ _FREE_RANKS = 5
 # Narrow labels suit classes as wide as the errors, wide labels suit new recordings. The middle
 # value is used where only one network can be trained.
 _SIGMAS = (1.5, 4.0, 10.0)
+# Of two classes, the fewest that a degree of freedom may have.
+_LEAST_EDGES = 3
 
 
 class CspConfig(Struct, frozen=True, tag="csp", tag_field="method", forbid_unknown_fields=True):
@@ -93,16 +106,25 @@ class Classes(nn.Module):
         self.used: Tensor
 
     @classmethod
-    def cut(cls, y: Array, count: int) -> Classes:
-        """Cut standardised training poses (n, 6) into at most ``count`` classes per DoF."""
+    def cut(cls, y: Array, count: int, reach: Array | None = None) -> Classes:
+        """Cut standardised training poses (n, 6) into at most ``count`` classes per DoF.
+
+        The outermost classes end at least at +-``reach`` (6,), by default a tenth of the range
+        beyond the training poses.
+        """
         rows, middles = [], []
-        for values in y.T:
+        for dof, values in enumerate(y.T):
             # A camera at rest repeats poses: use no more classes than there are gaps between poses.
             shares = min(count, np.unique(values).size - 1)
-            edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, shares + 1)))
+            edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, max(shares, 1) + 1)))
             margin = _MARGIN * (edges[-1] - edges[0])
+            if edges.size < _LEAST_EDGES:
+                # It stands still: one unit, the floor of its deviation, on either side.
+                edges, margin = np.array([edges[0], values.mean(), edges[-1]]), 1.0
             edges[0] -= margin
             edges[-1] += margin
+            if reach is not None:
+                edges[0], edges[-1] = min(edges[0], -reach[dof]), max(edges[-1], reach[dof])
             index = np.searchsorted(edges[1:-1], values, side="right")
             medians = [
                 np.median(values[index == k]) if (index == k).any() else edges[k : k + 2].mean()
@@ -218,16 +240,25 @@ class CspHead(ExportedHead):
     output_names = ("pose", "probabilities")
     runtime_method = "csp"
 
-    def __init__(self, network: CspNetwork, temperature: Tensor, setting: Setting) -> None:
+    def __init__(
+        self,
+        network: CspNetwork,
+        temperature: Tensor,
+        setting: Setting,
+        point: PointNetwork | None,
+    ) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.point = network, point
         self.decoder = PoseDecoder(setting.target)
+        if point is not None:
+            self.rotation = "tangent_predicted"
         self.register_buffer("temperature", temperature)
         self.temperature: Tensor
         self.register_buffer("medians", network.classes.medians.float())
         self.medians: Tensor
-        classes, target = network.classes, setting.target
-        edges = classes.edges.numpy() * target.std[:, np.newaxis] + target.mean[:, np.newaxis]
+        classes = network.classes
+        scale, origin = (values[:, np.newaxis] for values in _units(setting.target))
+        edges = classes.edges.numpy() * scale + origin
         used = classes.used.sum(dim=1).tolist()
         self._edges = [
             tuple(float(f"{edge:.9g}") for edge in row[: count + 1].tolist())
@@ -238,8 +269,10 @@ class CspHead(ExportedHead):
         """Return pose (n, 7) in metres and probabilities (n, 6, K)."""
         logits = self.network(features) / self.temperature[:, None]
         probabilities = torch.softmax(logits, dim=-1)
-        point = (probabilities * self.medians).sum(dim=-1)
-        return self.decoder.pose(self.decoder(point)), probabilities
+        middle = (probabilities * self.medians).sum(dim=-1)
+        if self.point is not None:
+            middle = torch.cat([middle[:, :3], self.point(features)[:, 3:]], dim=1)
+        return self.decoder.pose(self.decoder(middle)), probabilities
 
     def candidates(self) -> tuple[Candidate, ...]:
         """List ``aps`` first, then the paper's ``lac``, then ``raps`` with increasing penalties."""
@@ -255,9 +288,52 @@ class CspHead(ExportedHead):
         )
 
 
+def _units(target: Target) -> tuple[Array, Array]:
+    """Return unit and zero of the six standardised coordinates that classes divide, m and rad."""
+    if not target.turns:
+        return target.std, target.mean
+    return target.deviation, np.concatenate([target.mean[:3], np.zeros(3)])
+
+
+class _Lesson(NamedTuple):
+    """What the classes are learned from; the point network is None for a target of one chart."""
+
+    classes: Classes
+    examples: Examples | None
+    val_y: Array
+    point: PointNetwork | None
+
+
+def _lesson(lessons: Lessons, config: CspConfig) -> _Lesson:
+    target = lessons.setting.target
+    val_features, val_poses = lessons.val()
+    if not target.turns:
+        classes = Classes.cut(target.standardised(lessons.poses()), config.classes)
+        return _Lesson(classes, None, target.standardised(val_poses), None)
+    # The classes of the position learn from all frames, so the errors have to be of all, too.
+    residuals: Residuals = "held_out" if lessons.fine_tuned else "cross_fitted"
+    held_out = learn_held_out(lessons, "csp-point", residuals, config.hidden, config.feature_noise)
+    features, poses = lessons.features()
+    poses = poses[:, held_out.rows]
+
+    def standardised(point: Array, poses: Array) -> Array:
+        turn = residuals_of(lessons.setting, point, poses)[..., 3:] / target.deviation[3:]
+        return np.concatenate([target.standardised(poses)[..., :3], turn], axis=-1)
+
+    y = standardised(held_out.points(features), poses)
+    with torch.no_grad():
+        val_point = held_out.network(val_features).double().numpy()
+    val_y = standardised(val_point, val_poses)
+    # No error exceeds half a turn.
+    reach = np.concatenate([np.zeros(3), np.pi / target.deviation[3:]])
+    classes = Classes.cut(y.reshape(-1, DOF), config.classes, reach)
+    examples = Examples(features[:, held_out.rows], y, val_features, val_y)
+    return _Lesson(classes, examples, val_y, held_out.network)
+
+
 def _train(lessons: Lessons, config: CspConfig) -> CspHead:
     setting = lessons.setting
-    classes = Classes.cut(setting.target.standardised(lessons.poses()), config.classes)
+    lesson = _lesson(lessons, config)
     sigmas: tuple[float, ...] = _SIGMAS
     if config.label_sigma is not None:
         sigmas = (config.label_sigma,)
@@ -267,17 +343,19 @@ def _train(lessons: Lessons, config: CspConfig) -> CspHead:
     def learn(sigma: float) -> CspLearner:
         size = setting.feature_size
         return lessons.learn(
-            f"csp-sigma{sigma:g}", lambda: CspLearner(size, config, copy.deepcopy(classes), sigma)
+            f"csp-sigma{sigma:g}",
+            lambda: CspLearner(size, config, copy.deepcopy(lesson.classes), sigma),
+            examples=lesson.examples,
         )
 
     learners = [learn(sigma) for sigma in sigmas]
-    features, poses = lessons.val()
-    y = setting.target.standardised(poses)
+    features, _ = lessons.val()
+    y = lesson.val_y
     with torch.no_grad():
         network = min(learners, key=lambda learner: learner.val_score(features, y)).network
         logits = network(features).double()
-    temperature = best_temperatures(logits, classes.index(torch.from_numpy(y)))
-    return CspHead(network, temperature, setting)
+    temperature = best_temperatures(logits, lesson.classes.index(torch.from_numpy(y)))
+    return CspHead(network, temperature, setting, lesson.point)
 
 
 def best_temperatures(logits: Tensor, index: Tensor) -> Tensor:
@@ -297,9 +375,13 @@ def _restore(setting: Setting, config: CspConfig, state: Mapping[str, Tensor]) -
     prefix = "network.classes."
     classes = Classes(state[prefix + "edges"], state[prefix + "medians"])
     network = CspNetwork(setting.feature_size, config, classes)
-    head = CspHead(network, state["temperature"], setting)
+    point = None
+    if setting.target.turns:
+        size = setting.feature_size, setting.target.size
+        point = PointNetwork(*size, config.hidden, config.feature_noise)
+    head = CspHead(network, state["temperature"], setting, point)
     head.load_state_dict(state)
     return head
 
 
-METHOD = Method(CspConfig, _train, _restore)
+METHOD = Method(CspConfig, _train, _restore, turns=True)

@@ -74,10 +74,8 @@ class FusedHead(ExportedHead):
 
     def regressed(self, deep: Tensor) -> tuple[Tensor, Tensor]:
         """Map of the last stage -> pose (n, 7) and half-widths (n, 6)."""
-        point, lower, upper = (
-            self.decoder(values) for values in self.regression(self.pooled(deep))
-        )
-        return self.decoder.pose(point), 0.5 * (upper - lower)
+        pose, lower, upper = self.decoder.interval(*self.regression(self.pooled(deep)))
+        return pose, 0.5 * (upper - lower)
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Return the only score."""
@@ -108,7 +106,7 @@ def _train(lessons: Lessons, config: FusedConfig) -> FusedHead:
     features = np.stack([_features(scr.upper, pooled, maps[copy]) for copy in own])
     learner = lessons.learn(
         "cjp",
-        lambda: CjpLearner(pooled.size, _REGRESSION),
+        lambda: CjpLearner(pooled.size, _REGRESSION, target),
         examples=Examples(
             features,
             target.standardised(poses[own]),
@@ -132,7 +130,7 @@ def _restore(setting: Setting, config: FusedConfig, state: Mapping[str, Tensor])
     own = {name.removeprefix("scr."): v for name, v in state.items() if name.startswith("scr.")}
     scr = restored_scr(setting, config, own)
     size = Pooled(scr.upper.shape).size
-    head = FusedHead(scr, CjpNetwork(size, _REGRESSION), setting)
+    head = FusedHead(scr, CjpNetwork(size, _REGRESSION, setting.target.size), setting)
     head.load_state_dict(state)
     return head
 
@@ -145,4 +143,5 @@ METHOD = Method(
     copies=SCR.copies,
     steps=SCR.steps,
     augment=SCR.augment,
+    turns=True,
 )

@@ -57,7 +57,7 @@ from cvo_export.networks.heads.point import (
     principal_components,
     residuals_of,
 )
-from cvo_export.networks.standardised import PoseDecoder
+from cvo_export.networks.standardised import PoseDecoder, Target
 
 Array = NDArray[np.float64]
 
@@ -148,9 +148,9 @@ class McqrConfig(Struct, frozen=True, tag="mcqr", tag_field="method", forbid_unk
 class RegionLearner(Learner):
     """The region's networks, trained on scaled residuals given the condition."""
 
-    def __init__(self, config: McqrConfig) -> None:
+    def __init__(self, config: McqrConfig, target: Target) -> None:
         super().__init__()
-        condition = config.components + DOF
+        condition = config.components + target.size
         self.standardise = Standardise(condition, config.condition_noise)
         self.network = RegionNetwork(
             RegionConfig(
@@ -165,13 +165,13 @@ class RegionLearner(Learner):
         )
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
-        """Condition (n, components + 6), scaled residual (n, 6) -> scalar."""
+        """Condition (n, components + 6 or 9), scaled residual (n, 6) -> scalar."""
         return self.network.loss(self.standardise(features), y)
 
     def val_score(self, features: Tensor, y: Array) -> float:
         """Return the region's mean volume at 90 %, to the power 1/6, calibrated on these frames.
 
-        Condition (n, components + 6) and scaled residuals (n, 6).
+        Condition (n, components + 6 or 9) and scaled residuals (n, 6).
         """
         usual = Choice(_USUAL_KAPPA, np.arange(len(self.network.shells)))
         return mean_volume(self.network, self.standardise(features), y, usual, _FEW_DRAWS)
@@ -225,11 +225,11 @@ class McqrHead(ExportedHead):
         point = self.point(features)
         small = self.point.standardise(features) @ self.components
         c = self.standardise(torch.cat([small, point], dim=1))
-        coordinates = self.decoder(point)
+        pose = self.decoder.pose(self.decoder(point))
         scale = self.unit[:, None] * self.region.scale(c)
         codebook = self.region.codebook(c, self.kappa) @ scale.transpose(1, 2)
-        codebook = codebook + (coordinates * self.origin)[:, None]
-        return self.decoder.pose(coordinates), codebook, scale
+        codebook = codebook + (pose[:, :DOF] * self.origin)[:, None]
+        return pose, codebook, scale
 
     def candidates(self) -> tuple[Candidate, ...]:
         """Return the candidates of CQR; they apply to the six marginal intervals only."""
@@ -276,7 +276,10 @@ def _train(lessons: Lessons, config: McqrConfig) -> McqrHead:
         val_residual / unit,
     )
     learner = lessons.learn(
-        "mcqr-region", lambda: RegionLearner(config), examples=examples, candidate=False
+        "mcqr-region",
+        lambda: RegionLearner(config, setting.target),
+        examples=examples,
+        candidate=False,
     )
     choice = _choice(learner, examples, config, setting.seed)
     points = torch.from_numpy(choice.points)
@@ -306,10 +309,9 @@ def _choice(learner: RegionLearner, examples: Examples, config: McqrConfig, seed
 
 
 def _restore(setting: Setting, config: McqrConfig, state: Mapping[str, Tensor]) -> McqrHead:
-    point = PointNetwork(
-        setting.feature_size, config.hidden, config.feature_noise, config.point_dropout
-    )
-    learner = RegionLearner(config)
+    size = setting.feature_size, setting.target.size
+    point = PointNetwork(*size, config.hidden, config.feature_noise, config.point_dropout)
+    learner = RegionLearner(config, setting.target)
     learner.network.keep(state["points"])
     head = McqrHead(
         point,
@@ -324,4 +326,4 @@ def _restore(setting: Setting, config: McqrConfig, state: Mapping[str, Tensor]) 
     return head
 
 
-METHOD = Method(McqrConfig, _train, _restore)
+METHOD = Method(McqrConfig, _train, _restore, turns=True)

@@ -21,7 +21,7 @@ from cvo_export.networks.heads.base import (
     conformalised_score,
     dense,
 )
-from cvo_export.networks.standardised import PoseDecoder
+from cvo_export.networks.standardised import PoseDecoder, Target
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -47,26 +47,31 @@ _LEAST_DEVIATION = 1e-6
 
 
 class PointNetwork(nn.Module):
-    """Features (n, size) -> standardised pose (n, 6)."""
+    """Features (n, size) -> the ``outputs`` standardised numbers of the pose, 6 or 9."""
 
     def __init__(
-        self, size: int, hidden: tuple[int, int], feature_noise: float, dropout: float = 0.0
+        self,
+        size: int,
+        outputs: int,
+        hidden: tuple[int, int],
+        feature_noise: float,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         wide, narrow = hidden
-        self.dropout = dropout
+        self.outputs, self.dropout = outputs, dropout
         self.standardise = Standardise(size, feature_noise)
         self.layers = nn.Sequential(
-            *dense(size, wide), *dense(wide, narrow, dropout), nn.Linear(narrow, DOF)
+            *dense(size, wide), *dense(wide, narrow, dropout), nn.Linear(narrow, outputs)
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        """Shape (n, size) -> (n, 6)."""
+        """Shape (n, size) -> (n, outputs)."""
         point: Tensor = self.layers(self.standardise(features))
         return point
 
     def passes(self, features: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        """Features (n, size) -> stochastic passes with training dropout, (count, n, 6).
+        """Features (n, size) -> stochastic passes with dropout, (count, n, outputs).
 
         MC-dropout (Gal and Ghahramani 2016) after the last hidden layer; the layers before it are
         computed once.
@@ -85,21 +90,28 @@ class PointLearner(Learner):
     """The point network with mean absolute error, so that it predicts the median."""
 
     def __init__(
-        self, size: int, hidden: tuple[int, int], feature_noise: float, dropout: float = 0.0
+        self,
+        size: int,
+        target: Target,
+        hidden: tuple[int, int],
+        feature_noise: float,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        self.network = PointNetwork(size, hidden, feature_noise, dropout)
+        self.decoder = PoseDecoder(target)
+        self.network = PointNetwork(size, target.size, hidden, feature_noise, dropout)
         self.standardise = self.network.standardise
 
     def loss(self, features: Tensor, y: Tensor, warm_up: bool) -> Tensor:
-        """Features (n, size), truth (n, 6) -> scalar."""
+        """Features (n, size), truth (n, 6) or (n, 9) -> scalar."""
         error: Tensor = self.network(features) - y
         return error.abs().mean()
 
     def val_score(self, features: Tensor, y: Array) -> float:
         """See ``Learner``; scores intervals of constant width about the point."""
-        point = self.network(features).double().numpy()
-        return conformalised_score(point, point, y)
+        truth = torch.from_numpy(y).float()
+        error = self.decoder.errors(self.network(features), truth).double().numpy()
+        return conformalised_score(np.zeros_like(error), np.zeros_like(error), error)
 
 
 class HeldOut(NamedTuple):
@@ -120,8 +132,8 @@ class HeldOut(NamedTuple):
     parts: list[tuple[Indices, PointNetwork]]
 
     def points(self, features: NDArray[np.float16]) -> Array:
-        """Features (copies, n, size) -> standardised points (copies, rows, 6)."""
-        found = np.zeros((*features.shape[:2], DOF))
+        """Features (copies, n, size) -> standardised points (copies, rows, outputs)."""
+        found = np.zeros((*features.shape[:2], self.network.outputs))
         for part, network in self.parts:
             with torch.no_grad():
                 for copy, values in enumerate(features[:, part]):
@@ -129,15 +141,15 @@ class HeldOut(NamedTuple):
         return found[:, self.rows]
 
     def passes(self, features: NDArray[np.float16], count: int, seed: int) -> Array:
-        """Features (copies, n, size) -> stochastic points (count * copies, rows, 6)."""
+        """Features (copies, n, size) -> stochastic points (count * copies, rows, outputs)."""
         generator = torch.Generator().manual_seed(seed)
-        found = np.zeros((count, *features.shape[:2], DOF))
+        found = np.zeros((count, *features.shape[:2], self.network.outputs))
         for part, network in self.parts:
             with torch.no_grad():
                 for copy, values in enumerate(features[:, part]):
                     drawn = network.passes(torch.from_numpy(values).float(), count, generator)
                     found[:, copy, part] = drawn.numpy()
-        return found[:, :, self.rows].reshape(-1, self.rows.size, DOF)
+        return found[:, :, self.rows].reshape(-1, self.rows.size, self.network.outputs)
 
 
 def learn_held_out(
@@ -167,7 +179,7 @@ def learn_held_out(
         size = lessons.setting.feature_size
         return lessons.learn(
             lesson,
-            lambda: PointLearner(size, hidden, feature_noise, dropout),
+            lambda: PointLearner(size, lessons.setting.target, hidden, feature_noise, dropout),
             rows,
             candidate=candidate,
         ).network
@@ -184,17 +196,17 @@ def learn_held_out(
 
 
 def residuals_of(setting: Setting, point: Array, poses: Array) -> Array:
-    """Standardised points (..., 6), true poses (..., 7) -> (t - t_hat, Log(R_hat^T R)), (..., 6).
+    """Standardised points (..., k), true poses (..., 7) -> (t - t_hat, Log(R_hat^T R)), (..., 6).
 
     In metres and radians: the chart ``tangent_predicted`` relative to the prediction's coordinates.
     """
     decoder = PoseDecoder(setting.target)
-    flat = torch.from_numpy(point.reshape(-1, DOF)).float()
+    flat = torch.from_numpy(point.reshape(-1, setting.target.size)).float()
     predicted = decoder.pose(decoder(flat)).double().numpy()
     chart = Chart("tangent_predicted")
     origin = chart.coordinates(predicted, predicted)
     residual = chart.coordinates(poses.reshape(-1, 7), predicted) - origin
-    return np.asarray(residual).reshape(*point.shape)
+    return np.asarray(residual).reshape(*point.shape[:-1], DOF)
 
 
 def check_components(lessons: Lessons, count: int) -> None:

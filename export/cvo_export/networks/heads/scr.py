@@ -380,7 +380,7 @@ def trained_scr(lessons: Lessons, config: ScrConfig) -> ScrHead:
     targets = place.targets(poses)
     originals = poses[0]
     # A place that was only seen without moving along an axis still has a scale.
-    deviation = np.maximum(lessons.setting.target.std, 1e-3)
+    deviation = np.maximum(lessons.setting.target.deviation, 1e-3)
     starts = spread_poses(originals, _STARTS)
     judge = _Judge(PoseSolver(place.rays, starts, _DAMPING * deviation), place.focal_px, deviation)
     points = place.map.points
@@ -444,4 +444,5 @@ METHOD = Method(
     copies=16,
     steps=4000,
     augment=AugmentConfig(rotation_deg=8.0, motion_blur=0.3, zoom=0.15),
+    turns=True,
 )
