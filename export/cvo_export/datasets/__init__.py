@@ -6,11 +6,13 @@ from collections.abc import Callable
 
 from cvo_edge.errors import UsageError
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
+from cvo_export.datasets.colmap import open_colmap
 from cvo_export.datasets.euroc import open_euroc
 from cvo_export.datasets.kitti import open_kitti
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
 from cvo_export.datasets.seven_scenes import open_seven_scenes
 from cvo_export.datasets.synthetic import open_room
+from cvo_export.datasets.transforms import open_nerfstudio
 from cvo_export.datasets.tum import open_tum
 
 __all__ = ["FORMATS", "Intrinsics", "Lens", "PoseDataset", "open_dataset"]
@@ -21,6 +23,8 @@ FORMATS: dict[str, Callable[[str], PoseDataset]] = {
     "tum": open_tum,
     "kitti": open_kitti,
     "euroc": open_euroc,
+    "colmap": open_colmap,
+    "nerfstudio": open_nerfstudio,
     "synthetic": open_room,
 }
 
