@@ -7,13 +7,14 @@ keeps its method and gets thresholds from new data: a new site, another camera, 
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import onnx
-from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import (
@@ -29,7 +30,7 @@ from cvo_edge.bundle.format import (
 )
 from cvo_edge.camera import Camera
 from cvo_edge.engine.loading import read_bundle
-from cvo_edge.errors import BundleMismatchError, ModelError, SourceError, UsageError
+from cvo_edge.errors import BundleMismatchError, SourceError, UsageError
 from cvo_edge.geometry import mean_rotation
 from cvo_edge.heads import HEADS, Candidate
 from cvo_edge.heads.cqr import CqrParameters
@@ -56,6 +57,9 @@ from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.data.splits import Split, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
 from cvo_export.datasets.sizes import Size, one_size
+from cvo_export.graph.adapt import adapted, refuse_other_form
+from cvo_export.graph.adapt_options import read_input, read_outputs, read_size
+from cvo_export.graph.external import read_onnx
 from cvo_export.vocabulary import GivenRotation
 
 Array = NDArray[np.float64]
@@ -81,6 +85,9 @@ def calibrate(
     rotation: GivenRotation | None = None,
     crop: Crop | None = None,
     origin_m: Position | None = None,
+    given_input: str | None = None,
+    given_outputs: Sequence[str] = (),
+    size_text: str | None = None,
     new_data: bool = False,
     provider: Provider | None = None,
 ) -> Calibration:
@@ -94,6 +101,8 @@ def calibrate(
 
     ``rotation`` (None: ``tangent_predicted``), ``crop`` (None: ``none``) and ``origin_m`` (None:
     the world's own) describe a model file; its positions are relative to that origin.
+    ``given_input``, ``given_outputs`` and ``size_text`` are the texts of ``--input``, ``--output``
+    and ``--size``, which adapt a model file of another form (see ``graph.adapt``).
     ``new_data`` states that a data set with the name of the training data contains none of its
     frames. ``provider`` (None: the bundle's provider, or ``onnxruntime`` for a model file) is the
     inference engine that the new bundle is made for.
@@ -117,6 +126,10 @@ def calibrate(
             raise UsageError(
                 "rotation, crop, origin: expected only with an ONNX file; a bundle states its own"
             )
+        if given_input is not None or given_outputs or size_text is not None:
+            raise UsageError(
+                "input, output, size: expected only with an ONNX file; a bundle states its own"
+            )
         bundle = read_bundle(model)
         split = _split_of(bundle.calibration, dataset, kind, seed, new_data)
         draft = Draft.of(bundle.calibration)
@@ -125,7 +138,9 @@ def calibrate(
         model_bytes = bundle.model_bytes
         candidates = bundle.head.candidates()
     else:
-        model_bytes = _read_model(model)
+        model_bytes, left_out = _read_model(model, given_input, given_outputs, size_text)
+        if left_out:
+            print(f"outputs left out: {', '.join(left_out)}", file=sys.stderr)
         split = _new_split(dataset, kind, seed)
         if not all(abs(value) < MAX_NUMBER for value in origin_m or ()):
             raise UsageError(f"origin: expected metres below {MAX_NUMBER:g}, found {origin_m}")
@@ -204,20 +219,17 @@ def _new_split(dataset: PoseDataset, kind: SplitKind | None, seed: int | None) -
     return make_split(dataset, kind, seed or 0, "calibration")
 
 
-def _read_model(path: Path) -> bytes:
-    if not path.is_file():
-        raise ModelError(f"{path}: expected an ONNX file or a bundle folder, found neither")
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be read: {error.strerror}") from None
+def _read_model(
+    path: Path, given: str | None, outputs: Sequence[str], size: str | None
+) -> tuple[bytes, tuple[str, ...]]:
+    """Return a model file in a bundle's form, and which of its outputs were left out."""
+    model = read_onnx(path)
+    if given is None and size is None and not outputs:
+        return model.SerializeToString(), ()
+    return adapted(model, read_input(given), read_outputs(outputs), read_size(size))
 
 
-def _opset(model_bytes: bytes) -> int:
-    try:
-        model = onnx.load_from_string(model_bytes)
-    except DecodeError:
-        raise ModelError("model: expected an ONNX file, found something else") from None
+def _opset(model: onnx.ModelProto) -> int:
     versions = [entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")]
     return int(max(versions, default=1))
 
@@ -232,7 +244,9 @@ def _from_model(
     origin_m: Position | None,
 ) -> Draft:
     """Return a draft for a model of which only the tensors and the data's poses are known."""
-    spec = model_spec(model_bytes, _opset(model_bytes))
+    model = onnx.load_from_string(model_bytes)
+    refuse_other_form(model)
+    spec = model_spec(model_bytes, _opset(model))
     outputs = {tensor.name: tensor.shape for tensor in spec.outputs}
     shape = spec.inputs[0].shape if len(spec.inputs) == 1 else ()
     image = {"name": "image", "dtype": "uint8", "shape": (1, *shape[1:3], 3)}

@@ -106,6 +106,29 @@ def calibrate(
             show_default=False,
         ),
     ] = None,
+    given_input: Annotated[
+        str | None,
+        typer.Option(
+            "--input",
+            help="ONNX file: its input, e.g. layout=nchw,range=0-1,mean=.5/.5/.5,order=bgr.",
+            show_default=False,
+        ),
+    ] = None,
+    given_outputs: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--output",
+            help="ONNX file: an output, e.g. pose=NAME or rotation=NAME,form=quaternion_wxyz.",
+            show_default=False,
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            help="ONNX file: HEIGHTxWIDTH of its input, if the graph does not say.",
+            show_default=False,
+        ),
+    ] = None,
     new_data: Annotated[
         bool,
         typer.Option("--new-data", help="Bundle: treat a data set of the same name as unseen."),
@@ -120,7 +143,7 @@ def calibrate(
 
     An ONNX file has the input image, uint8 of shape (1, height, width, 3), RGB,
     and the output pose (1, 7); for intervals that adapt, also the outputs lower
-    and upper (1, 6).
+    and upper (1, 6). --input, --output and --size adapt a file of another form.
     """
     from cvo_edge.programs.inspect import inspect_lines
     from cvo_export.calibrate import calibrate as calibrate_network
@@ -140,6 +163,9 @@ def calibrate(
         rotation=rotation,
         crop=crop,
         origin_m=origin,
+        given_input=given_input,
+        given_outputs=given_outputs or (),
+        size_text=size,
         new_data=new_data,
         provider=provider,
     )
