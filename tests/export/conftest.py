@@ -100,7 +100,8 @@ def _drawn_once() -> Iterator[None]:
     draw = synthetic._Flight.photograph
 
     def photograph(flight: Any, frame: int, intrinsics: Any, size: tuple[int, int]) -> Any:
-        key = (flight._entropy, flight._yaw, tuple(flight._still), frame, size)
+        path = flight._yaw, tuple(flight._still), flight._tag_m
+        key = (flight._entropy, path, frame, size)
         if key not in _PICTURES:
             _PICTURES[key] = draw(flight, frame, intrinsics, size)
         return _PICTURES[key].copy()

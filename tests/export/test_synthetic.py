@@ -14,7 +14,7 @@ from cvo_edge.errors import UsageError
 from cvo_edge.geometry import quaternion_to_matrix
 from cvo_export.datasets.base import Intrinsics
 from cvo_export.datasets.synthetic import open_room
-from cvo_export.scene.room import ROOM_M, room
+from cvo_export.scene.room import ROOM_M, room, tagged_room
 
 SMALL = "room,flights=3,frames=4,size=96x72"
 SIZE = (160, 120)
@@ -247,3 +247,39 @@ def test_near_poses_look_alike_and_far_ones_do_not(flights):
     assert (distance.argmin(axis=1) == np.arange(len(frames))).all()
     off_diagonal = distance[~np.eye(len(frames), dtype=bool)]
     assert np.median(off_diagonal) > 3 * np.median(np.diag(distance))
+
+
+# -------------------------------------------------------------------------------------- the tag
+
+
+def test_a_tag_changes_only_its_own_pixels():
+    """Without the option nothing changes; with it, the rest of the frame keeps its pixels."""
+    plain = open_room("room,flights=1,frames=1,size=320x240").read_image(0)
+    tagged = open_room("room,flights=1,frames=1,size=320x240,tag=0.2").read_image(0)
+    rows, columns = np.nonzero((plain != tagged).any(axis=2))
+    # The paper measures 0.25 m at 2.4 m distance: about 30 pixels.
+    assert 20 < np.ptp(rows) < 40
+    assert 20 < np.ptp(columns) < 40
+    assert room().faces == tagged_room(0.2).faces[:-1]
+
+
+def test_the_tag_has_its_edge_length_at_its_place():
+    """The corners that a detector finds are the projections of a square of 0.2 m on the wall."""
+    dataset = open_room("room,flights=1,frames=1,size=640x480,tag=0.2")
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    corners, numbers, _ = cv2.aruco.ArucoDetector(family).detectMarkers(dataset.read_image(0))
+    assert np.ravel(numbers).tolist() == [0]
+    face = tagged_room(0.2).faces[-1]
+    share = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]])
+    square = face.corner + share @ np.array([face.edge_u, face.edge_v])
+    assert np.allclose(np.linalg.norm(square - np.roll(square, 1, axis=0), axis=1), 0.2)
+    seen = (square - dataset.poses[0, :3]) @ quaternion_to_matrix(dataset.poses[0, 3:])
+    fx, fy, cx, cy = dataset.intrinsics
+    pixels = seen[:, :2] / seen[:, 2:] * (fx, fy) + (cx, cy)
+    assert np.abs(pixels - corners[0].reshape(4, 2)).max() < 1.0
+
+
+@pytest.mark.parametrize("item", ["tag=", "tag=0", "tag=0.5", "tag=nan", "tag=20cm"])
+def test_a_tag_that_fits_no_wall_is_refused(item):
+    with pytest.raises(UsageError, match=r"expected tag=0\.02\.\.0\.3 in metres, found"):
+        open_room(f"room,{item}")

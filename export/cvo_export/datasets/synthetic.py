@@ -15,8 +15,8 @@ import numpy as np
 from cvo_edge.errors import UsageError
 from cvo_edge.geometry import quaternion_exp, quaternion_multiply
 from cvo_export.datasets.base import Intrinsics, PoseDataset
-from cvo_export.scene.renderer import Floats, Image, as_image
-from cvo_export.scene.room import room
+from cvo_export.scene.renderer import Floats, Image, Scene, as_image
+from cvo_export.scene.room import room, tagged_room
 from cvo_export.scene.sensor import Light, add_noise, motion_blur
 
 # ------------------------------------------------------------------------------- specification
@@ -32,6 +32,7 @@ class _Options(NamedTuple):
     seed: int = 0
     turn: int = 0
     still: tuple[str, ...] = ()
+    tag_m: float = 0.0
 
 
 def open_room(spec: str = "room") -> PoseDataset:
@@ -43,7 +44,8 @@ def open_room(spec: str = "room") -> PoseDataset:
         ``room``, then any of ``,flights=48`` (1..1000), ``,frames=50`` (per flight, 1..10000),
         ``,size=320x240`` (64x48..1920x1080) and ``,seed=0`` (0..4294967295). ``,turn=1`` lets the
         camera turn round and round; ``,still=z+pitch+roll`` holds any of x y z yaw pitch roll, here
-        those of a wheeled robot. Frame j of flight i depends only on these, the size, the seed, i
+        those of a wheeled robot; ``,tag=0.2`` (0.02..0.3) hangs an AprilTag with edges of so many
+        metres on the front wall. Frame j of flight i depends only on these, the size, the seed, i
         and j, so more flights or frames do not change the earlier ones.
 
     Returns
@@ -60,11 +62,7 @@ def open_room(spec: str = "room") -> PoseDataset:
     options = _parse(spec)
     fx = _FOCAL_PER_WIDTH * options.width
     intrinsics = Intrinsics(fx, fx, (options.width - 1) / 2, (options.height - 1) / 2)
-    still = [_NAMES.index(name) for name in options.still]
-    flights = [
-        _Flight(options.seed, number, bool(options.turn), still)
-        for number in range(options.flights)
-    ]
+    flights = [_Flight(options, number) for number in range(options.flights)]
     times_s = np.arange(options.frames, dtype=np.float64) * _FRAME_TIME_S
     names = tuple(f"flight-{number:02d}" for number in range(1, options.flights + 1))
 
@@ -90,6 +88,7 @@ def _parse(spec: str) -> _Options:
         raise UsageError(f"expected a synthetic scene named room, found {name!r} in {spec!r}")
     values: dict[str, int] = {}
     still: tuple[str, ...] = ()
+    tag_m: float | None = None
     for item in items:
         key, _, text = item.partition("=")
         if key == "size":
@@ -103,9 +102,14 @@ def _parse(spec: str) -> _Options:
                 raise UsageError(
                     f"expected still= with names among {'+'.join(_NAMES)}, found {item!r}"
                 )
+        elif key == "tag" and tag_m is None:
+            found, tag_m = {}, _edge(text)
+            if tag_m is None:
+                raise UsageError(f"expected tag=0.02..0.3 in metres, found {item!r} in {spec!r}")
         else:
             raise UsageError(
-                "expected an option flights=, frames=, size=, seed=, turn= or still= once, found "
+                "expected an option flights=, frames=, size=, seed=, turn=, still= or tag=, each "
+                "once, found "
                 f"{item!r} in {spec!r}"
             )
         for field, digits in found.items():
@@ -115,7 +119,16 @@ def _parse(spec: str) -> _Options:
             if not (digits.isascii() and digits.isdigit() and low <= int(digits) <= high):
                 raise UsageError(f"expected {_EXPECTED[key]}, found {item!r} in {spec!r}")
             values[field] = int(digits)
-    return _Options(**values, still=still)
+    return _Options(**values, still=still, tag_m=tag_m or 0.0)
+
+
+def _edge(text: str) -> float | None:
+    """Return the edge length of a tag that fits on the wall, or None."""
+    try:
+        edge = float(text)
+    except ValueError:
+        return None
+    return edge if 0.02 <= edge <= 0.3 else None
 
 
 _RANGES = {
@@ -157,17 +170,21 @@ _RATES_RAD_S = np.array([1.28, 2.72, 4.8])
 class _Flight:
     """One camera trajectory over continuous time, its light and its sensor noise."""
 
-    def __init__(self, seed: int, number: int, turns: bool, still: list[int]) -> None:
-        self._entropy = (seed, number)
-        self._still = still
+    def __init__(self, options: _Options, number: int) -> None:
+        self._entropy = (options.seed, number)
+        self._tag_m = options.tag_m
+        self._still = [_NAMES.index(name) for name in options.still]
         # Start and rate of the turns, from a stream of their own.
         around = self._rng(_TURN_STREAM)
         rate = around.uniform(*_TURN_RAD_S) * around.choice([-1.0, 1.0])
-        self._yaw = (around.uniform(0.0, 2 * math.pi), rate) if turns else (0.0, 0.0)
+        self._yaw = (around.uniform(0.0, 2 * math.pi), rate) if options.turn else (0.0, 0.0)
         rng = self._rng(0)
         self._rate = _RATES_RAD_S * rng.uniform(0.8, 1.25, (6, 3))
         self._phase = rng.uniform(0, 2 * math.pi, (6, 3))
         self._light = Light(rng)
+
+    def _scene(self) -> Scene:
+        return tagged_room(self._tag_m) if self._tag_m else room()
 
     def _rng(self, stream: int) -> np.random.Generator:
         return np.random.default_rng((*self._entropy, stream))
@@ -189,7 +206,7 @@ class _Flight:
         """Render a frame with this flight's blur, light and noise, (height, width, 3), BGR."""
         time_s = frame * _FRAME_TIME_S
         opening, pose, closing = self.poses(time_s + _EXPOSURE_S * np.array([-0.5, 0.0, 0.5]))
-        sharp = room().render(pose, intrinsics, size)
+        sharp = self._scene().render(pose, intrinsics, size)
         image = motion_blur(sharp, opening, pose, closing, intrinsics)
         self._light.shade(image, time_s, intrinsics)
         add_noise(image, self._rng(frame + 1))

@@ -15,6 +15,7 @@ from cvo_export.scene.renderer import Image, as_image
 Colour = tuple[int, int, int]  # BGR
 Paint = Callable[[np.random.Generator, int, int, Colour], Image]  # height and width in texels
 
+TAG_MODULE_TEXELS = 16
 WALL_TEXELS_M = 240  # fixed, because pictures on a wall have a size in metres
 
 
@@ -245,3 +246,12 @@ def front_wall(rng: np.random.Generator, height: int, width: int, colour: Colour
     _hang(image, poster(rng, 96, 120, (170, 110, 40)), 3.3, 1.2, (20, 20, 60))
     _hang(image, poster(rng, 170, 110, (60, 150, 90)), 0.3, 0.2, (220, 220, 220))
     return image
+
+
+def tag() -> Image:
+    """Paint AprilTag 36h11 number 0: 8 x 8 modules and a white margin of one module."""
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    square = cv2.aruco.generateImageMarker(family, 0, 8 * TAG_MODULE_TEXELS)
+    margin = np.pad(square, TAG_MODULE_TEXELS, constant_values=255)
+    # Paper and ink are neither white nor black.
+    return as_image(np.repeat(20 + 0.85 * margin[..., None].astype(np.float32), 3, axis=2))

@@ -33,6 +33,9 @@ _VIEWS = {
 # Light on a surface, by the viewing direction from which it is seen.
 _LIGHT = {"+y": 0.97, "-y": 0.8, "+x": 0.8, "-x": 0.9, "-z": 1.06, "+z": 0.6}
 
+# A little in front of the wall, right of the window and above the screen.
+_TAG_CENTRE_M = (0.45, 1.99, 1.32)
+
 _Sides = dict[str, tuple[Floats, Floats, Floats]]  # view -> corner, edge_u and edge_v of a face
 
 
@@ -57,6 +60,20 @@ def room() -> Scene:
     """Return the room with walls, floor, ceiling and furniture; textures are painted only once."""
     boxes = [_box(np.random.default_rng((2, n)), row) for n, row in enumerate(_FURNITURE)]
     return Scene([*_shell(), *(face for box in boxes for face in box)])
+
+
+@functools.cache
+def tagged_room(edge_m: float) -> Scene:
+    """Return the room with an AprilTag on the front wall, where every flight sees it.
+
+    The tag is number 0 of the family 36h11; ``edge_m`` is the edge of its black square. A white
+    margin of one module surrounds it, without which it could not be found.
+    """
+    modules = paint.tag().shape[0] // paint.TAG_MODULE_TEXELS
+    size = edge_m * modules / (modules - 2)
+    corner = np.subtract(_TAG_CENTRE_M, (size / 2, 0, -size / 2))
+    edges = np.array([[size, 0, 0], [0, 0, -size]])
+    return Scene([*room().faces, Face(corner, edges[0], edges[1], paint.tag())])
 
 
 def _cuboid(centre: Floats, size: Floats, yaw: float, inside: bool) -> _Sides:
