@@ -8,7 +8,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal, Protocol
 
-Stage = Literal["features", "map", "training", "fine-tuning"]
+Stage = Literal[
+    "features",
+    "map",
+    "training",
+    "fine-tuning",
+    # Those of reconstruct.
+    "motion",
+    "images",
+    "matching",
+    "mapping",
+    "tags",
+]
 
 
 class Progress(Protocol):

@@ -9,11 +9,11 @@ from cvo_export.cli.app import app
 
 # Importing a module registers its commands; help lists them in this order.
 # isort: off
-from cvo_export.cli import train, bundles, figures, studies
+from cvo_export.cli import reconstruct, train, bundles, figures, studies
 
 # isort: on
 
-__all__ = ["app", "bundles", "figures", "main", "studies", "train"]
+__all__ = ["app", "bundles", "figures", "main", "reconstruct", "studies", "train"]
 
 
 def main() -> NoReturn:
