@@ -127,7 +127,7 @@ def test_the_lowest_constraints_are_the_declared_lower_bounds():
     ("file", "name", "extras"),
     [
         ("runtime.txt", "cvo-edge", ("openvino", "sign")),
-        ("export.txt", "cvo-export", ("plot", "ray")),
+        ("export.txt", "cvo-export", ("plot", "ray", "rosbag")),
     ],
 )
 def test_pinned_versions_are_in_the_closure_and_in_the_declared_ranges(file, name, extras):

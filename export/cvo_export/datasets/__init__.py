@@ -10,6 +10,7 @@ from cvo_export.datasets.colmap import open_colmap
 from cvo_export.datasets.euroc import open_euroc
 from cvo_export.datasets.kitti import open_kitti
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
+from cvo_export.datasets.rosbag import open_rosbag
 from cvo_export.datasets.seven_scenes import open_seven_scenes
 from cvo_export.datasets.synthetic import open_room
 from cvo_export.datasets.transforms import open_nerfstudio
@@ -25,6 +26,7 @@ FORMATS: dict[str, Callable[[str], PoseDataset]] = {
     "euroc": open_euroc,
     "colmap": open_colmap,
     "nerfstudio": open_nerfstudio,
+    "rosbag": open_rosbag,
     "synthetic": open_room,
 }
 

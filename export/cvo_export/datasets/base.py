@@ -78,6 +78,10 @@ class PoseDataset:
         Number of frames that the reader left out, by reason.
     left_out
         Number of images beside the frames that show no colour, e.g. depth, by reason.
+    stamps_ns
+        Shape (n,), int64: when each frame was taken, nanoseconds; None if that is not known.
+    chosen
+        What the reader chose in files that hold several things, e.g. topics of a bag.
     """
 
     name: str
@@ -93,6 +97,8 @@ class PoseDataset:
     own_test: frozenset[int] = frozenset()
     skipped: Mapping[str, int] = field(default_factory=dict)
     left_out: Mapping[str, int] = field(default_factory=dict)
+    stamps_ns: NDArray[np.int64] | None = None
+    chosen: str = ""
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -36,6 +36,7 @@ def describe(dataset: PoseDataset) -> list[str]:
     counts = np.bincount(dataset.sequence, minlength=len(dataset.sequence_names))
     return [
         summary(dataset),
+        *([f"read        {dataset.chosen}"] if dataset.chosen else []),
         *([f"left out    {left_out_text(dataset.left_out)}"] if dataset.left_out else []),
         f"image       {width} x {height} px{mixed}",
         f"camera      {camera}",

@@ -29,6 +29,7 @@ class FrameList:
         self._images: list[Path] = []
         self._poses: list[Array] = []
         self._sequence: list[int] = []
+        self._stamps_ns: list[int | None] = []
         # Dictionaries keep insertion order, which numbers the sequences.
         self._sequence_names: dict[str, int] = {}
         self._frame_names: dict[str, None] = {}
@@ -41,10 +42,18 @@ class FrameList:
         self._left_out.update(listing.left_out)
         return listing.images
 
-    def add(self, sequence: str, name: str, image: Path, pose: Array | None) -> None:
+    def add(
+        self,
+        sequence: str,
+        name: str,
+        image: Path,
+        pose: Array | None,
+        stamp_ns: int | None = None,
+    ) -> None:
         """Add a frame with its ``T_world_camera`` (7,), or count it as skipped.
 
-        A pose of None is invalid. A sequence appears only if at least one of its frames is kept.
+        A pose of None is invalid; a stamp of None is unknown. A sequence appears only if at least
+        one of its frames is kept.
         """
         frame = f"{sequence}/{name}"
         if pose is None:
@@ -59,11 +68,16 @@ class FrameList:
             self._images.append(image)
             self._poses.append(pose)
             self._sequence.append(number)
+            self._stamps_ns.append(stamp_ns)
 
     def add_numbered(
-        self, sequence: str, images: Mapping[int, Path], poses: Sequence[Array | None]
+        self,
+        sequence: str,
+        images: Mapping[int, Path],
+        poses: Sequence[Array | None],
+        stamps_ns: Sequence[int] = (),
     ) -> None:
-        """Add images with the poses of the same number, from 0; skip those without a partner."""
+        """Add images with poses (and stamps) of the same number; skip those without a partner."""
         for number in sorted(images.keys() | range(len(poses))):
             if number not in images:
                 self.skip("image missing")
@@ -71,7 +85,8 @@ class FrameList:
                 self.skip("no pose")
             else:
                 image = images[number]
-                self.add(sequence, frame_name(image.name), image, poses[number])
+                stamp_ns = stamps_ns[number] if number < len(stamps_ns) else None
+                self.add(sequence, frame_name(image.name), image, poses[number], stamp_ns)
 
     def skip(self, reason: str) -> None:
         """Count a skipped frame."""
@@ -92,6 +107,7 @@ class FrameList:
             image_size=partial(_size_of, tuple(self._images)),
             skipped=dict(self._skipped),
             left_out=dict(self._left_out),
+            stamps_ns=None if None in self._stamps_ns else np.array(self._stamps_ns, np.int64),
         )
 
 

@@ -47,4 +47,4 @@ def add_associated(
         if nearest is None:
             frames.skip(f"no pose within {bound_ns / 1e9:g} s")
         else:
-            frames.add(sequence, image.stem, image, pose_of(order[nearest]))
+            frames.add(sequence, image.stem, image, pose_of(order[nearest]), stamp_ns)
