@@ -159,3 +159,22 @@ def test_no_sequence_is_refused(tmp_path):
     with pytest.raises(SourceError) as refusal:
         open_kitti(str(tmp_path))
     assert str(refusal.value) == f"{tmp_path}: expected a sequence with poses, found none"
+
+
+def test_poses_in_the_folder_of_the_sequence_are_read_if_there_are_no_others(tmp_path):
+    sequence = root_with(tmp_path)
+    expected = open_kitti(str(sequence)).poses
+    (tmp_path / "poses" / "00.txt").rename(sequence / "poses.txt")
+    np.testing.assert_array_equal(open_kitti(str(sequence)).poses, expected)
+
+
+@pytest.mark.parametrize("name", ["000003.jpg", "3.png"])
+def test_two_images_of_one_number_are_refused(tmp_path, name):
+    sequence = root_with(tmp_path)
+    folder = sequence / "image_2"
+    shutil.copy(folder / "000003.png", folder / name)
+    with pytest.raises(SourceError) as caught:
+        open_kitti(str(sequence))
+    first, second = sorted(["000003.png", name])
+    expected = f"{folder}: expected one image for each number, found {first} and {second}"
+    assert str(caught.value) == expected

@@ -33,13 +33,15 @@ _SUFFIXES = (".png", ".jpg")
 def open_kitti(path: str) -> PoseDataset:
     """Read one sequence, ``ROOT/sequences/NN``, with its poses in ``ROOT/poses/NN.txt``.
 
+    SemanticKITTI (Behley et al. 2019) has the same poses in ``ROOT/sequences/NN/poses.txt``.
     Each sequence has its own world frame; ``path`` may be ``ROOT`` if only one sequence has poses.
     Images, poses and intrinsics are those of the left colour camera (``image_2``) or, if it is
     missing, of the left grey camera (``image_0``). Frames with a missing image, a missing pose or
     an invalid pose are left out and counted. The data set is named ``kitti-NN``. ``times.txt`` is
     not read.
 
-    Raises SourceError if there are several sequences, a file is malformed, or no frame has a pose.
+    Raises SourceError if there are several sequences, a file is malformed, two images have one
+    number, or no frame has a pose.
     """
     root = Path(path).absolute()
     folder = root
@@ -62,12 +64,22 @@ def open_kitti(path: str) -> PoseDataset:
 
 
 def _pose_file(folder: Path) -> Path:
-    return folder.parent.parent / "poses" / f"{folder.name}.txt"
+    """Return KITTI's file of poses or, without it, SemanticKITTI's in the sequence's folder."""
+    own, beside = folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"
+    return own if own.is_file() and not beside.is_file() else beside
 
 
 def _images(folder: Path) -> dict[int, Path]:
-    files = (file for suffix in _SUFFIXES for file in folder.glob("*" + suffix))
-    return {int(file.stem): file for file in files if file.stem.isdecimal()}
+    found: dict[int, Path] = {}
+    for file in sorted(file for suffix in _SUFFIXES for file in folder.glob("*" + suffix)):
+        if not file.stem.isdecimal():
+            continue
+        first = found.setdefault(int(file.stem), file)
+        if first != file:
+            raise SourceError(
+                f"{folder}: expected one image for each number, found {first.name} and {file.name}"
+            )
+    return found
 
 
 def _calibration(path: Path, camera: int) -> tuple[Intrinsics, Array]:
