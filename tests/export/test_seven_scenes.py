@@ -114,9 +114,10 @@ def test_writing_a_sequence_gives_it_back(tmp_path):
         write_sequence(rendered, 0, tmp_path / "clip", 2)
 
 
-@pytest.mark.parametrize("text", ["room", "colmap:x", "", "synthetic", ":room"])
+@pytest.mark.parametrize("text", ["room", "folder:x", "", "synthetic", ":room"])
 def test_an_unknown_format_lists_those_there_are(text):
-    with pytest.raises(UsageError, match="7scenes, rgbd-scenes, tum, kitti, euroc, synthetic"):
+    known = "7scenes, rgbd-scenes, tum, kitti, euroc, colmap, nerfstudio, rosbag, synthetic"
+    with pytest.raises(UsageError, match=known):
         open_dataset(text)
 
 
