@@ -58,11 +58,11 @@ def one_of_a_scene(data, scene):
 def test_an_interval_is_finite_only_without_a_reason_against_it(odometer, scene):
     seen = Counter()
 
-    # Hypothesis does not draw evenly: of 600, sometimes only 46 were ok.
+    # Hypothesis does not draw evenly: of 600 with two kinds of five from a scene, 46 were ok once.
     @settings(max_examples=600)
     @given(data=st.data(), stamp_ns=stamps)
     def law(data, stamp_ns):
-        kind = data.draw(st.sampled_from(["none", "anything", "image", "scene", "scene"]))
+        kind = data.draw(st.sampled_from(["none", "anything", "image", *("scene",) * 4]))
         image = {
             "none": lambda: None,
             "anything": lambda: data.draw(anything),
@@ -80,7 +80,7 @@ def test_an_interval_is_finite_only_without_a_reason_against_it(odometer, scene)
 
     law()
     # Degraded estimates are rare: distorted images seldom yield a plausible pose.
-    assert min(seen[Status.OK], seen[Status.INVALID]) > 20, seen
+    assert min(seen[Status.OK], seen[Status.INVALID]) > 50, seen
 
 
 @settings(max_examples=60)

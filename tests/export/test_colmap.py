@@ -133,6 +133,16 @@ def test_broken_models_are_refused_with_their_place(tmp_path):
         open_dataset(f"colmap:{tmp_path / 't'}")
 
 
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/secret.png"])
+def test_an_image_outside_the_folder_of_images_is_refused(tmp_path, name):
+    write_images(tmp_path / "images")
+    write_text(tmp_path / "sparse/0")
+    listed = tmp_path / "sparse/0/images.txt"
+    listed.write_text(listed.read_text().replace(NAMES[0], name))
+    with pytest.raises(SourceError, match=f"expected names of images below .*found '{name}'"):
+        open_dataset(f"colmap:{tmp_path}")
+
+
 def transforms(root, shared, each=lambda i: {}):
     axes = np.diag([1.0, -1.0, -1.0, 1.0])
     frames = [

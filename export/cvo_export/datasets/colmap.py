@@ -64,8 +64,9 @@ def open_colmap(path: str) -> PoseDataset:
     Images lie in ``images``, in the project or beside the model. Images in several folders are one
     sequence a folder. Frames with an invalid pose or a missing image are left out and counted.
 
-    Raises SourceError if there is no model, a file is malformed, the images have several cameras
-    or a camera model without a counterpart here, or no frame has a pose.
+    Raises SourceError if there is no model, a file is malformed or names an image elsewhere, the
+    images have several cameras or a camera model without a counterpart here, or no frame has a
+    pose.
     """
     root = Path(path)
     folder = _model_folder(root)
@@ -77,6 +78,10 @@ def open_colmap(path: str) -> PoseDataset:
     name = root.resolve().name
     for image in sorted(found, key=lambda image: natural_key(Path(image.name))):
         place = PurePosixPath(image.name)
+        if place.is_absolute() or ".." in place.parts:
+            raise SourceError(
+                f"{folder}: expected names of images below {images}, found {image.name!r}"
+            )
         sequence = str(place.parent) if place.parent.name else name
         frames.add(sequence, place.stem, images / image.name, image.pose)
     used = {image.camera for image in found}
