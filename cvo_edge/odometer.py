@@ -313,8 +313,8 @@ class Odometer(Labelled):
         age_ms = frame.age_ms(self._clock.now_s())
         verdict = self._watch.judge(observation, processed.seq, frame, age_ms)
         doubts = verdict.doubts
-        if doubts:
-            found = unbounded_set()
+        centre = self.chart.turn_centre(observation.point)
+        found = unbounded_set() if doubts else found.trimmed(centre)
         position_m = observation.pose[:3]
         if self.origin_m is not None:
             origin_m = np.array(self.origin_m)

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 Rotation = Literal["euler_zyx", "tangent_predicted", "tangent_reference"]
 
 _TRANSLATION = ("tx", "ty", "tz")
+_NO_TURN = np.zeros(3)
+_NO_TURN.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +114,13 @@ class Chart:
             q_base_inverse = geometry.quaternion_conjugate(q_base)
             turn = geometry.quaternion_log(geometry.quaternion_multiply(q_base_inverse, p[..., 3:]))
         return np.concatenate(np.broadcast_arrays(p[..., :3], turn), axis=-1)
+
+    def turn_centre(self, point: Array) -> Array:
+        """Return the three coordinates from which every rotation is within half a turn; point (6,).
+
+        The prediction's own for ``euler_zyx``, zero for a tangent chart.
+        """
+        return point[3:] if self.rotation == "euler_zyx" else _NO_TURN
 
     def point(self, pose: Array) -> Array:
         """Return ``coordinates(pose, pose)`` of one pose (7,), in a tenth of the time.

@@ -118,6 +118,26 @@ class ConformalSet:
             )
         return replace(self, lower=lower, upper=upper, bands=bands)
 
+    def trimmed(self, turn: ArrayLike) -> ConformalSet:
+        """Return the set without rotations beyond half a turn from three coordinates (3,).
+
+        No pose has such coordinates, so coverage is the same. Infinite sides stay.
+        """
+        about = np.asarray(turn, dtype=np.float64).tolist()
+        sides = [*zip(about * 2, [*self.lower[3:].tolist(), *self.upper[3:].tolist()], strict=True)]
+        if not any(math.pi < abs(bound - at) < math.inf for at, bound in sides):
+            return self
+        trimmed = np.array([_trimmed(at, bound) for at, bound in sides])
+        bands = self.bands
+        if bands is not None:
+            turns = (
+                tuple((_trimmed(at, low), _trimmed(at, high)) for low, high in row)
+                for at, row in zip(about, bands[3:], strict=True)
+            )
+            bands = (*bands[:3], *turns)
+        lower, upper = (np.r_[self.lower[:3], trimmed[:3]], np.r_[self.upper[:3], trimmed[3:]])
+        return replace(self, lower=lower, upper=upper, bands=bands)
+
     def moved(self, offset_m: Array) -> ConformalSet:
         """Return the set with all positions moved by an offset (3,), in float64."""
         step = np.concatenate([offset_m, np.zeros(3)])
@@ -176,6 +196,11 @@ class ConformalSet:
                 for value, row in zip(y.tolist(), self.bands, strict=True)
             ]
         )
+
+
+def _trimmed(at: float, bound: float) -> float:
+    """Return a finite bound within half a turn of a coordinate."""
+    return min(max(bound, at - math.pi), at + math.pi) if math.isfinite(bound) else bound
 
 
 _UNBOUNDED = ConformalSet(np.full(6, -np.inf), np.full(6, np.inf))

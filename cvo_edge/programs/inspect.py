@@ -72,7 +72,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         if entry.q_hat_upper is not None:
             sides = [(" low", entry.q_hat), (" high", entry.q_hat_upper)]
         for side, values in sides:
-            cells = "".join(f"{'unbounded' if v is None else f'{v:.5f}':>10}" for v in values)
+            cells = "".join(f"{'unbounded' if v is None else _number(v):>10}" for v in values)
             lines.append(f"{f'{entry.confidence:g} {entry.scope}{side}':<18}" + cells)
     return [
         *lines,
@@ -133,7 +133,7 @@ def _widths(calibration: Calibration, head: Head) -> list[str]:
     for entry, found in zip(calibration.thresholds, sets, strict=True):
         width = found.width()
         if np.isfinite(width).any():
-            cells = "".join(f"{'unbounded' if w == np.inf else f'{w:.5f}':>10}" for w in width)
+            cells = "".join(f"{'unbounded' if w == np.inf else _number(w):>10}" for w in width)
             lines.append(f"{f'{entry.confidence:g} {entry.scope}':<18}" + cells)
     return lines
 
@@ -237,3 +237,8 @@ def calibration_schema() -> dict[str, Any]:
         **document,
         "$defs": components,
     }
+
+
+def _number(value: float) -> str:
+    """Return a number in at most nine characters, so that columns stay apart."""
+    return f"{value:.5f}" if value < 999.5 else f"{value:.6g}"

@@ -142,16 +142,10 @@ class RunSummary:
             )
         lines.append(f"memory MiB  peak {memory_mib()['peak_rss']:.0f}")
         width = self.width_sum / max(1, self.bounded)
-        # Shown in centimetres and degrees.
-        shown = np.concatenate([width[:3] * 100, np.rad2deg(width[3:])])
-        units = ["cm"] * 3 + ["deg"] * 3
         lines.append(f"at {self.confidence:g} {self.scope}" + "".join(f"{n:>9}" for n in self.dof))
         if self.bounded:
-            # Three digits before the point leave no room for one after it.
-            cells = "".join(
-                f"{f'{v:.1f} {u}' if v < 99.95 else f'{v:.0f} {u}':>9}"
-                for v, u in zip(shown, units, strict=True)
-            )
+            shown = [*map(_length, width[:3].tolist()), *map(_turn, width[3:].tolist())]
+            cells = "".join(f"{cell:>9}" for cell in shown)
             lines.append("mean width".ljust(len(lines[-1]) - 54) + cells)
         if self.with_truth and not self.compared:
             nothing = "no frame matched the ground truth, by name or by stamp"
@@ -166,6 +160,22 @@ class RunSummary:
                 + f"   all six {self.covered_jointly / self.compared:.3f} of {self.compared} frames"
             )
         return lines
+
+
+def _length(width_m: float) -> str:
+    """Return a width in at most eight characters, with the unit that suits it."""
+    if width_m < 9.995:
+        return _short(100.0 * width_m, "cm")
+    return _short(width_m, "m") if width_m < 999.5 else _short(1e-3 * width_m, "km")
+
+
+def _turn(width_rad: float) -> str:
+    return _short(math.degrees(width_rad), "deg")
+
+
+def _short(value: float, unit: str) -> str:
+    # Three digits before the point leave no room for one after it.
+    return f"{value:.1f} {unit}" if value < 99.95 else f"{value:.0f} {unit}"
 
 
 def _adapted_line(adapted: Adapted) -> str:

@@ -77,6 +77,39 @@ def test_yaw_across_the_cut_is_near_the_prediction():
     assert estimate(interval, at[0], chart).contains(at[1])
 
 
+@pytest.mark.parametrize("rotation", ["tangent_reference", "tangent_predicted", "euler_zyx"])
+@pytest.mark.parametrize("disjoint", [False, True])
+@given(
+    arrays(np.float64, (2, 4), elements=st.floats(-1.0, 1.0)).filter(
+        lambda q: (np.linalg.norm(q, axis=1) > 0.1).all()
+    ),
+    arrays(np.float64, (2, 6), elements=st.floats(0.0, 9.0) | st.just(np.inf)),
+)
+def test_a_set_trimmed_to_half_a_turn_covers_the_same_poses(rotation, disjoint, turns, reach):
+    chart = Chart(rotation, np.array([0.5, 0.5, -0.5, 0.5]) if "reference" in rotation else None)
+    poses = [np.concatenate([np.zeros(3), geometry.quaternion_normalise(q)]) for q in turns]
+    point, truth = (chart.coordinates(pose, poses[0]) for pose in poses)
+    lower, upper = point - reach[0], point + reach[1]
+    bands = None
+    if disjoint:
+        cuts = zip(
+            lower.tolist(),
+            point.tolist(),
+            (point + reach[1] / 2).tolist(),
+            upper.tolist(),
+            strict=True,
+        )
+        bands = tuple(((a, b), (c, d)) if np.isfinite(d - a) else ((a, d),) for a, b, c, d in cuts)
+    whole = ConformalSet(lower, upper, bands)
+    trimmed = whole.trimmed(chart.turn_centre(point))
+    np.testing.assert_array_equal(trimmed.covers(truth), whole.covers(truth))
+    np.testing.assert_array_equal(np.isfinite(trimmed.lower), np.isfinite(whole.lower))
+    np.testing.assert_array_equal(np.isfinite(trimmed.upper), np.isfinite(whole.upper))
+    width = trimmed.width()
+    assert (width[3:][np.isfinite(width[3:])] <= 2 * np.pi + 1e-9).all()
+    np.testing.assert_array_equal(width[:3], whole.width()[:3])
+
+
 def test_bands_respect_the_gap_and_width_is_that_of_the_union():
     bands = (((-1.0, -0.5), (0.5, 1.0)),) + (((-1.0, 1.0),),) * 5
     region = ConformalSet(np.full(6, -1.0), np.full(6, 1.0), bands)

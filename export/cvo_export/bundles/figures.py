@@ -138,7 +138,13 @@ class Sets:
 
     def level(self, entry: Threshold) -> dict[str, Any]:
         """Return the report's entry for one threshold."""
-        sets = self.seen.sets(self.odometer.head, entry)
+        chart = self.odometer.chart
+        sets = [
+            each.trimmed(chart.turn_centre(point))
+            for each, point in zip(
+                self.seen.sets(self.odometer.head, entry), self.seen.point, strict=True
+            )
+        ]
         covered = self.covered(sets)
         bounded = np.array([np.isfinite((each.lower, each.upper)).all() for each in sets])
         limits = workspace(self.calibration.pose)
