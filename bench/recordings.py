@@ -3,10 +3,10 @@
     python bench/recordings.py WORK [--cases NAME ...] [--methods NAME ...] [--copies N] [--steps N]
 
 Real recordings come from ``CVO_DATA``, the backbone from ``CVO_WEIGHTS``. Each case is trained with
-its default split, through the commands that a user calls. Test frames are then written as a folder
-and run by ``cvo-edge run``. ``constant`` is the error of one pose for all test frames, the mean of
-the training poses: what a network must beat. A repetition of the command continues; WORK keeps the
-runs. Results: ``results/recordings/CASE-METHOD.json``.
+its default split (``-random``: frame by frame), through the commands that a user calls. Test frames
+are then written as a folder and run by ``cvo-edge run``. ``constant`` is the error of one pose for
+all test frames, the mean of the training poses. A repetition of the command continues; WORK keeps
+the runs. Results: ``results/recordings/CASE-METHOD.json``.
 """
 
 from __future__ import annotations
@@ -53,9 +53,12 @@ def kitchen(folder: Path, origin_m: tuple[float, ...] = (0.0, 0.0, 0.0), frames:
 # What is trained, and the case that it stands beside.
 CASES: dict[str, tuple[str, str | None]] = {
     "redkitchen-400": ("", None),
+    "redkitchen-400-random": ("", "redkitchen-400"),
     "redkitchen-400-utm": ("", "redkitchen-400"),
     "euroc-mh05": (f"euroc:{DATA / 'euroc_mh05'}", None),
+    "euroc-mh05-random": (f"euroc:{DATA / 'euroc_mh05'}", "euroc-mh05"),
     "kitti-00": (f"kitti:{DATA / 'kitti_00'}", None),
+    "kitti-00-random": (f"kitti:{DATA / 'kitti_00'}", "kitti-00"),
     "room": (ROOM, None),
     "room-full-turn": (f"{ROOM},turn=1", "room"),
     "room-planar": (f"{ROOM},turn=1,still=z+pitch+roll", "room-full-turn"),
@@ -66,7 +69,7 @@ CASES: dict[str, tuple[str, str | None]] = {
 
 def spec(case: str, work: Path) -> str:
     """Return the data set of a case as FORMAT:PATH."""
-    if case == "redkitchen-400":
+    if case in ("redkitchen-400", "redkitchen-400-random"):
         return kitchen(work / "data" / case)
     if case == "redkitchen-400-utm":
         return kitchen(work / "data" / case, UTM_M)
@@ -138,7 +141,8 @@ def main() -> None:
             trained = call(
                 "cvo-export", "train", method, text, run, "--weights", WEIGHTS, "--cache",
                 options.work / "cache" / case, "--copies", str(options.copies),
-                *(() if method == "csp" else ("--steps", str(options.steps))),
+                "--steps", str(options.steps),
+                *(("--split", "random") if case.endswith("-random") else ()),
             )  # fmt: skip
             print(trained, call("cvo-export", "publish", run, bundle), flush=True)
             report = options.work / "reports" / f"{case}-{method}.json"

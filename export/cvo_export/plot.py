@@ -97,7 +97,8 @@ class Track(NamedTuple):
     """A bundle's estimates for n frames, with the truth.
 
     ``truth`` (n, 6) holds the true poses in the bundle's chart, NaN for frames without an
-    estimate; ``rows`` are the positions of the frames whose estimate has a pose.
+    estimate; ``rows`` are the positions of the frames whose estimate has a pose; ``parts`` (n,)
+    counts the parts in which the frames follow each other in one recording.
     """
 
     calibration: Calibration
@@ -105,6 +106,7 @@ class Track(NamedTuple):
     estimates: list[PoseInterval]
     truth: Array
     rows: list[int]
+    parts: NDArray[np.int64]
 
 
 def track(
@@ -140,7 +142,10 @@ def track(
         if not rows:
             raise SourceError(f"{dataset.name}: expected frames with a pose, found none")
         truth = _truth(odometer.chart, estimates, dataset.poses[indices])
-        return Track(odometer.calibration, odometer.chart, estimates, truth, rows)
+        apart = np.diff(indices) != 1
+        apart |= np.diff(dataset.sequence[indices]) != 0
+        parts = np.cumsum(np.concatenate([[False], apart]))
+        return Track(odometer.calibration, odometer.chart, estimates, truth, rows, parts)
 
 
 def _step(odometer: Odometer, dataset: PoseDataset, index: int) -> PoseInterval:
@@ -174,7 +179,7 @@ def draw_dof(axes: Axes, drawn: Track, dof: int, *, relative: bool = False) -> N
 
     ``relative`` draws offsets from the point.
     """
-    _, chart, estimates, truth, rows = drawn
+    _, chart, estimates, truth, rows, parts = drawn
     scale, unit = (1.0, "m") if dof < 3 else (float(np.rad2deg(1.0)), "deg")
     point = np.array([chart.point(_array(estimates[row]))[dof] for row in rows])
     about = dof > 2 and chart.rotation == "tangent_predicted"
@@ -204,8 +209,13 @@ def draw_dof(axes: Axes, drawn: Track, dof: int, *, relative: bool = False) -> N
         ):
             missed.append(row)
     axes.bar(places, heights, 1.0, bottoms, color=BAND, alpha=0.6, linewidth=0, label="set")
-    axes.plot(rows, scale * (point - origin[rows]), color=POINT, linewidth=0.9, label="point")
-    axes.plot(rows, shown, color=TRUTH, linewidth=0.9, label="truth")
+    cuts = np.flatnonzero(np.diff(parts[rows])) + 1
+    with_gaps = np.insert(np.array(rows, dtype=np.float64), cuts, np.nan)
+    for line, color, name in (
+        (scale * (point - origin[rows]), POINT, "point"),
+        (shown, TRUTH, "truth"),
+    ):
+        axes.plot(with_gaps, np.insert(line, cuts, np.nan), color=color, linewidth=0.9, label=name)
     regions = any(estimates[row].conformal_set.ellipsoids for row in rows)
     label = "outside the six-DoF region" if regions else "missed"
     axes.plot(missed, values[missed], "x", color=MISSED, markersize=5, label=label)
@@ -223,7 +233,7 @@ def draw_from_above(axes: Axes, drawn: Track) -> None:
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
-    _, _, estimates, truth, rows = drawn
+    _, _, estimates, truth, rows, _ = drawn
     boxes = []
     for row in rows[:: max(1, len(rows) // BOXES)]:
         plane = np.unique(estimates[row].position_boxes()[:, :2], axis=0)

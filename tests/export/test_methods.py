@@ -20,7 +20,7 @@ from cvo_edge.output.sinks import Sink
 from cvo_edge.sets import scaled_distance
 from cvo_export import publish as publishing
 from cvo_export.bundles.observed import observe
-from cvo_export.evaluate import evaluate, find_level, table
+from cvo_export.evaluate import evaluate, find_level, subset_indices, table
 from cvo_export.networks.heads.cqr import CqrConfig
 from cvo_export.networks.heads.csp import (
     Classes,
@@ -185,7 +185,12 @@ def test_a_picture_shows_the_sets_that_are_evaluated(runs):
     _, run, bundle = runs("cqr")
     image = run.dataset.read_image(0)
     repeating = dataclasses.replace(run.dataset, read_image=lambda _: image)
-    drawn = track(bundle, repeating).estimates
+    found = track(bundle, repeating)
+    indices = subset_indices(read_calibration(bundle), run.dataset, "test")
+    # Lines end where the next test frame is not the next frame of its recording.
+    follows = (np.diff(indices) == 1) & (np.diff(run.dataset.sequence[indices]) == 0)
+    np.testing.assert_array_equal(np.diff(found.parts) == 0, follows)
+    drawn = found.estimates
     frames = evaluate(bundle, repeating, "test")["frames"]
     assert frames["total"] == frames["bounded"] == len(drawn)
     assert all(np.isfinite(estimate.lower).all() for estimate in drawn)
