@@ -97,7 +97,7 @@ _PICTURES: dict[Any, Any] = {}
 @pytest.fixture(scope="session", autouse=True)
 def _drawn_once() -> Iterator[None]:
     """Draw each picture of the scene once: many tests train on the same scene."""
-    draw = synthetic._Flight.photograph
+    draw = synthetic.Flight.photograph
 
     def photograph(flight: Any, frame: int, intrinsics: Any, size: tuple[int, int]) -> Any:
         path = flight._yaw, tuple(flight._still), flight._tag_m
@@ -107,7 +107,7 @@ def _drawn_once() -> Iterator[None]:
         return _PICTURES[key].copy()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic._Flight, "photograph", photograph)
+        patch.setattr(synthetic.Flight, "photograph", photograph)
         yield
 
 

@@ -94,14 +94,14 @@ def test_each_recording_of_train_fit_and_cal_is_whole_in_one_fold(run):
 
 
 def test_what_a_folds_recordings_show_has_no_part_in_its_head(run, tmp_path, monkeypatch):
-    photograph = synthetic._Flight.photograph
+    photograph = synthetic.Flight.photograph
     of_fold = set(run.dataset.sequence[run.fold_frames[1]].tolist())
 
     def negative(flight, *wanted):
         image = photograph(flight, *wanted)
         return 255 - image if flight._entropy[1] in of_fold else image
 
-    monkeypatch.setattr(synthetic._Flight, "photograph", negative)
+    monkeypatch.setattr(synthetic.Flight, "photograph", negative)
     other = train(tmp_path / "run", config(), ignore_progress)
     assert equal(run.folds[1], other.folds[1])
     assert not equal(run.folds[0], other.folds[0])

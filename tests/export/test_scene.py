@@ -8,10 +8,12 @@ import pytest
 
 from cvo_edge.geometry import quaternion_exp, quaternion_multiply, quaternion_to_matrix
 from cvo_export.datasets.base import Intrinsics
-from cvo_export.datasets.synthetic import open_room
+from cvo_export.datasets.synthetic import open_synthetic
+from cvo_export.scene.drive import HEIGHT_M, lap
 from cvo_export.scene.renderer import Face, Scene
 from cvo_export.scene.room import room
 from cvo_export.scene.sensor import motion_blur
+from cvo_export.scene.street import street
 
 SIZE = (160, 120)
 CAMERA = Intrinsics(146.25, 146.25, 79.5, 59.5)
@@ -21,7 +23,7 @@ WHITE = np.full((32, 32, 3), 255, np.uint8)
 @pytest.fixture(scope="module")
 def poses():
     """Poses inside the room, shape (2400, 7)."""
-    return open_room("room,flights=40,frames=60").poses
+    return open_synthetic("room,flights=40,frames=60").poses
 
 
 def project(points, pose, camera):
@@ -141,23 +143,27 @@ def test_a_face_seen_edge_on_hides_nothing():
     assert np.array_equal(alone, both)
 
 
-@pytest.mark.parametrize("frame", [130, 777, 1500, 2222])
-def test_room_agrees_with_ray_casting(poses, frame):
-    """Every pixel shows the nearest surface on its ray; rays half a pixel off fit worse."""
-    pose = poses[frame]
-    image = room().render(pose, CAMERA, SIZE).astype(float)
-    pixels = np.random.default_rng(frame).integers((4, 4), (156, 116), (1500, 2))
+def misfits(scene, pose, count, shifts):
+    """Return the mean difference of a rendering from ray casting, with rays shifted by pixels."""
+    image = scene.render(pose, CAMERA, SIZE).astype(float)
+    pixels = np.random.default_rng(count).integers((4, 4), (156, 116), (count, 2))
     shown = image[pixels[:, 1], pixels[:, 0]]
     samples = np.stack(np.meshgrid([-0.25, 0.25], [-0.25, 0.25]), -1).reshape(-1, 2)
 
     def misfit(shift):
-        faces = room().faces
-        cast_colours = [cast(faces, pixels + shift + offset, pose, CAMERA) for offset in samples]
-        return np.abs(np.mean(cast_colours, axis=0) - shown).mean()
+        found = [cast(scene.faces, pixels + shift + offset, pose, CAMERA) for offset in samples]
+        return np.abs(np.mean(found, axis=0) - shown).mean()
 
-    exact = misfit((0, 0))
+    return [misfit(shift) for shift in shifts]
+
+
+@pytest.mark.parametrize("frame", [130, 777, 1500, 2222])
+def test_room_agrees_with_ray_casting(poses, frame):
+    """Every pixel shows the nearest surface on its ray; rays half a pixel off fit worse."""
+    shifts = (0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)
+    exact, *others = misfits(room(), poses[frame], 1500, shifts)
     assert exact < 6
-    assert all(misfit(shift) > 1.1 * exact for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)))
+    assert all(other > 1.1 * exact for other in others)
 
 
 def test_pure_rotation_is_a_homography(poses):
@@ -178,6 +184,57 @@ def test_pure_rotation_is_a_homography(poses):
         difference = np.abs(expected.astype(float) - second)[overlap]
         assert overlap.mean() > 0.4
         assert difference.mean() < 3.5
+
+
+# --------------------------------------------------------------------------------------- street
+
+
+@pytest.fixture(scope="module")
+def drives():
+    """Poses of two drives of two laps each, shape (2, 400, 7)."""
+    return open_synthetic("street,drives=2,frames=400").poses.reshape(2, 400, 7)
+
+
+def test_street_agrees_with_ray_casting(drives):
+    """Nothing is drawn through houses, cars or trees; every ray ends at a face or the sky."""
+    exact, other = misfits(street(), drives[0, 40], 400, [(0, 0), (3, 0)])
+    assert exact < 10
+    assert other > 1.5 * exact
+
+
+def test_a_lap_is_closed_and_turns_once_around(drives):
+    """The car comes back to where it was, one full turn later, and looks everywhere meanwhile."""
+    path = lap()
+    assert np.allclose(path.place[-1], path.place[0], atol=1e-6)
+    assert path.heading[-1] == pytest.approx(2 * np.pi)
+    forward = quaternion_to_matrix(drives.reshape(-1, 7)[:, 3:])[..., 2].reshape(2, 400, 3)
+    yaw = np.unwrap(np.arctan2(forward[..., 1], forward[..., 0]), axis=1)
+    assert (yaw[:, -1] - yaw[:, 0] > 3.5 * np.pi).all()
+
+
+def test_drives_are_continuous_and_look_ahead(drives):
+    """No jump at the end of a lap; the car moves where the camera looks, at constant height."""
+    place = drives[..., :3]
+    assert np.array_equal(place[..., 2], np.full((2, 400), HEIGHT_M))
+    step = np.diff(place, axis=1)
+    metres = np.linalg.norm(step, axis=-1)
+    assert 0.7 < metres.min() < metres.max() < 2.2
+    assert np.linalg.norm(np.diff(step, axis=1), axis=-1).max() < 0.4
+    forward = quaternion_to_matrix(drives.reshape(-1, 7)[:, 3:])[..., 2].reshape(2, 400, 3)
+    middle = forward[:, 1:] + forward[:, :-1]
+    along = np.sum(step * middle, axis=-1) / metres / np.linalg.norm(middle, axis=-1)
+    assert along.min() > np.cos(np.radians(3))
+
+
+def test_the_car_keeps_its_distance_from_everything(drives):
+    place = drives.reshape(-1, 7)[:, :3]
+    clearance = np.inf
+    for corner, u, v, _ in street().faces:
+        a = ((place - corner) @ u / (u @ u)).clip(0, 1)
+        b = ((place - corner) @ v / (v @ v)).clip(0, 1)
+        nearest = corner + a[:, None] * u + b[:, None] * v
+        clearance = min(clearance, np.linalg.norm(place - nearest, axis=1).min())
+    assert clearance > 0.6
 
 
 # --------------------------------------------------------------------------------------- sensor

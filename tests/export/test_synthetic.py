@@ -13,7 +13,7 @@ import pytest
 from cvo_edge.errors import UsageError
 from cvo_edge.geometry import quaternion_to_matrix
 from cvo_export.datasets.base import Intrinsics
-from cvo_export.datasets.synthetic import open_room
+from cvo_export.datasets.synthetic import open_synthetic
 from cvo_export.scene.room import ROOM_M, room, tagged_room
 
 SMALL = "room,flights=3,frames=4,size=96x72"
@@ -23,7 +23,7 @@ SIZE = (160, 120)
 @pytest.fixture(scope="module")
 def flights():
     """Many flights, of which only the poses are used."""
-    return open_room("room,flights=40,frames=60,size=160x120")
+    return open_synthetic("room,flights=40,frames=60,size=160x120")
 
 
 # ------------------------------------------------------------------------------------ interface
@@ -31,7 +31,7 @@ def flights():
 
 def test_default_is_48_flights_of_50_frames():
     """The bare name gives the documented sizes, without rendering."""
-    dataset = open_room()
+    dataset = open_synthetic()
     assert dataset.name == "synthetic-room"
     assert len(dataset) == 48 * 50 == len(dataset.frame_names) == len(set(dataset.frame_names))
     assert dataset.sequence_names[:2] == ("flight-01", "flight-02")
@@ -52,7 +52,7 @@ def test_poses_are_unit_quaternions(flights):
 
 def test_images_have_the_size_asked_for():
     """Images are uint8 BGR of the requested size, including odd sizes."""
-    image = open_room("room,flights=1,frames=1,size=101x63").read_image(0)
+    image = open_synthetic("room,flights=1,frames=1,size=101x63").read_image(0)
     assert image.shape == (63, 101, 3)
     assert image.dtype == np.uint8
 
@@ -60,7 +60,7 @@ def test_images_have_the_size_asked_for():
 def test_opening_paints_nothing():
     """The textures are built when the first image is read, not on import or open."""
     code = (
-        "from cvo_export.datasets.synthetic import open_room; d = open_room();"
+        "from cvo_export.datasets.synthetic import open_synthetic; d = open_synthetic();"
         "from cvo_export.scene.room import room; assert room.cache_info().currsize == 0;"
         "d.read_image(0); assert room.cache_info().currsize == 1"
     )
@@ -92,12 +92,16 @@ def test_opening_paints_nothing():
         ("room,seed=4294967296", "seed=0..4294967295", "seed=4294967296"),
         ("room,seed=1,seed=1", "seed once", "twice"),
         ("room,size=64x48,size=64x48", "size once", "twice"),
+        ("room,drives=2", "flights=", "drives=2"),
+        ("street,flights=2", "drives=, frames=, size= or seed=", "flights=2"),
+        ("street,turn=1", "drives=, frames=, size= or seed=", "turn=1"),
+        ("street,drives=1001", "drives=1..1000", "drives=1001"),
     ],
 )
 def test_bad_specification_is_refused(spec, expected, found):
     """One line states what was expected and what was found."""
     with pytest.raises(UsageError) as error:
-        open_room(spec)
+        open_synthetic(spec)
     message = str(error.value)
     assert expected in message
     assert found in message
@@ -107,7 +111,7 @@ def test_bad_specification_is_refused(spec, expected, found):
 def test_frame_past_the_end_is_an_index_error():
     """Reading past the last frame raises IndexError."""
     with pytest.raises(IndexError):
-        open_room(SMALL).read_image(12)
+        open_synthetic(SMALL).read_image(12)
 
 
 # ---------------------------------------------------------------------------------- determinism
@@ -115,7 +119,7 @@ def test_frame_past_the_end_is_an_index_error():
 
 def test_images_are_identical_in_any_order_and_thread():
     """A frame's bytes depend only on its number."""
-    first, second = open_room(SMALL), open_room(SMALL)
+    first, second = open_synthetic(SMALL), open_synthetic(SMALL)
     forwards = [first.read_image(i) for i in range(12)]
     with ThreadPoolExecutor(2) as pool:
         backwards = list(pool.map(second.read_image, reversed(range(12))))[::-1]
@@ -125,8 +129,8 @@ def test_images_are_identical_in_any_order_and_thread():
 
 def test_more_flights_and_frames_leave_the_earlier_ones_unchanged():
     """Flight i, frame j is the same in a longer data set."""
-    short = open_room(SMALL)
-    long = open_room("room,flights=5,frames=9,size=96x72")
+    short = open_synthetic(SMALL)
+    long = open_synthetic("room,flights=5,frames=9,size=96x72")
     same = [9 * flight + frame for flight in range(3) for frame in range(4)]
     assert np.array_equal(short.poses, long.poses[same])
     assert short.frame_names == tuple(long.frame_names[i] for i in same)
@@ -134,9 +138,21 @@ def test_more_flights_and_frames_leave_the_earlier_ones_unchanged():
         assert np.array_equal(short.read_image(i), long.read_image(same[i]))
 
 
+def test_drives_depend_on_their_number_alone():
+    """Drive i, frame j is the same in a longer data set, and without the option by default."""
+    long = open_synthetic("street")
+    assert long.name == "synthetic-street"
+    assert long.sequence_names[:2] == ("drive-01", "drive-02")
+    short = open_synthetic("street,drives=3,frames=7")
+    same = [200 * drive + frame for drive in range(3) for frame in range(7)]
+    assert np.array_equal(short.poses, long.poses[same])
+
+
 def test_seed_draws_other_flights():
     """Another seed gives other trajectories."""
-    assert not np.allclose(open_room(SMALL).poses, open_room(SMALL + ",seed=1").poses, atol=0.01)
+    assert not np.allclose(
+        open_synthetic(SMALL).poses, open_synthetic(SMALL + ",seed=1").poses, atol=0.01
+    )
 
 
 # ------------------------------------------------------------------------------------- flights
@@ -218,7 +234,7 @@ def test_photograph_shows_what_the_pose_says(flights):
 
 def test_flights_differ_in_light():
     """Brightness and colour vary more between flights than sensor noise does."""
-    dataset = open_room("room,flights=8,frames=1,size=96x72")
+    dataset = open_synthetic("room,flights=8,frames=1,size=96x72")
     ratios = [
         dataset.read_image(i).mean(axis=(0, 1))
         / room().render(dataset.poses[i], dataset.intrinsics, (96, 72)).mean(axis=(0, 1))
@@ -254,8 +270,8 @@ def test_near_poses_look_alike_and_far_ones_do_not(flights):
 
 def test_a_tag_changes_only_its_own_pixels():
     """Without the option nothing changes; with it, the rest of the frame keeps its pixels."""
-    plain = open_room("room,flights=1,frames=1,size=320x240").read_image(0)
-    tagged = open_room("room,flights=1,frames=1,size=320x240,tag=0.2").read_image(0)
+    plain = open_synthetic("room,flights=1,frames=1,size=320x240").read_image(0)
+    tagged = open_synthetic("room,flights=1,frames=1,size=320x240,tag=0.2").read_image(0)
     rows, columns = np.nonzero((plain != tagged).any(axis=2))
     # The paper measures 0.25 m at 2.4 m distance: about 30 pixels.
     assert 20 < np.ptp(rows) < 40
@@ -265,7 +281,7 @@ def test_a_tag_changes_only_its_own_pixels():
 
 def test_the_tag_has_its_edge_length_at_its_place():
     """The corners that a detector finds are the projections of a square of 0.2 m on the wall."""
-    dataset = open_room("room,flights=1,frames=1,size=640x480,tag=0.2")
+    dataset = open_synthetic("room,flights=1,frames=1,size=640x480,tag=0.2")
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     corners, numbers, _ = cv2.aruco.ArucoDetector(family).detectMarkers(dataset.read_image(0))
     assert np.ravel(numbers).tolist() == [0]
@@ -282,4 +298,4 @@ def test_the_tag_has_its_edge_length_at_its_place():
 @pytest.mark.parametrize("item", ["tag=", "tag=0", "tag=0.5", "tag=nan", "tag=20cm"])
 def test_a_tag_that_fits_no_wall_is_refused(item):
     with pytest.raises(UsageError, match=r"expected tag=0\.02\.\.0\.3 in metres, found"):
-        open_room(f"room,{item}")
+        open_synthetic(f"room,{item}")

@@ -12,7 +12,7 @@ from cvo_export.datasets.kitti import open_kitti
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
 from cvo_export.datasets.rosbag import open_rosbag
 from cvo_export.datasets.seven_scenes import open_seven_scenes
-from cvo_export.datasets.synthetic import open_room
+from cvo_export.datasets.synthetic import open_synthetic
 from cvo_export.datasets.transforms import open_nerfstudio
 from cvo_export.datasets.tum import open_tum
 
@@ -27,7 +27,7 @@ FORMATS: dict[str, Callable[[str], PoseDataset]] = {
     "colmap": open_colmap,
     "nerfstudio": open_nerfstudio,
     "rosbag": open_rosbag,
-    "synthetic": open_room,
+    "synthetic": open_synthetic,
 }
 
 

@@ -1,32 +1,29 @@
-"""The synthetic room as a data set: flights with exact poses, for demonstration and tests.
+"""Virtual places as data sets: recordings with exact poses, for demonstration and tests.
 
-The scene is the same for every seed; ``cvo_export.scene.room`` describes it and its world frame.
-The seed determines the flights, their light and their noise. The principal point is the image
-centre, ((width - 1) / 2, (height - 1) / 2). Motion blur is centred on the pose of its frame.
+The places are the same for every seed; ``cvo_export.scene.room`` and ``cvo_export.scene.street``
+describe them and their world frames. The seed determines the recordings, their light and their
+noise. The principal point is the image centre, ((width - 1) / 2, (height - 1) / 2). Motion blur is
+centred on the pose of its frame.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from cvo_edge.errors import UsageError
-from cvo_edge.geometry import quaternion_exp, quaternion_multiply
 from cvo_export.datasets.base import Intrinsics, PoseDataset
-from cvo_export.scene.renderer import Floats, Image, Scene, as_image
-from cvo_export.scene.room import room, tagged_room
-from cvo_export.scene.sensor import Light, add_noise, motion_blur
-
-# ------------------------------------------------------------------------------- specification
-
-_FOCAL_PER_WIDTH = 0.9140625  # Kinect: 585 px at 640 px, a horizontal field of view of 57 degrees
+from cvo_export.scene.drive import Drive
+from cvo_export.scene.flight import DEGREES_OF_FREEDOM, Flight
+from cvo_export.scene.recording import Recording
+from cvo_export.scene.renderer import Image
 
 
 class _Options(NamedTuple):
-    flights: int = 48
-    frames: int = 50
+    recordings: int
+    frames: int
     width: int = 320
     height: int = 240
     seed: int = 0
@@ -35,8 +32,18 @@ class _Options(NamedTuple):
     tag_m: float = 0.0
 
 
-def open_room(spec: str = "room") -> PoseDataset:
-    """Open the synthetic room; ``read_image`` renders the images.
+class _Place(NamedTuple):
+    """What can be seen, in which recordings, with which options by default."""
+
+    recording: str
+    record: Callable[[_Options, int], Recording]
+    focal_per_width: float
+    keys: tuple[str, ...]
+    default: _Options
+
+
+def open_synthetic(spec: str = "room") -> PoseDataset:
+    """Open a virtual place; ``read_image`` renders the images.
 
     Parameters
     ----------
@@ -45,35 +52,47 @@ def open_room(spec: str = "room") -> PoseDataset:
         ``,size=320x240`` (64x48..1920x1080) and ``,seed=0`` (0..4294967295). ``,turn=1`` lets the
         camera turn round and round; ``,still=z+pitch+roll`` holds any of x y z yaw pitch roll, here
         those of a wheeled robot; ``,tag=0.2`` (0.02..0.3) hangs an AprilTag with edges of so many
-        metres on the front wall. Frame j of flight i depends only on these, the size, the seed, i
-        and j, so more flights or frames do not change the earlier ones.
+        metres on the front wall.
+
+        ``street``, then any of ``,drives=10``, ``,frames=200``, ``,size=320x240`` and ``,seed=0``,
+        in the same ranges: a car that goes round a block, 265 m and about 170 frames a lap.
+
+        Frame j of recording i depends only on these, the size, the seed, i and j, so more
+        recordings or frames do not change the earlier ones.
 
     Returns
     -------
     PoseDataset
-        Named ``synthetic-room``, with one sequence per flight. ``read_image`` may be called from
-        several threads, in any order, and raises ``IndexError`` past the last frame.
+        Named ``synthetic-room`` or ``synthetic-street``, with one sequence per recording.
+        ``read_image`` may be called from several threads, in any order, and raises ``IndexError``
+        past the last frame.
 
     Raises
     ------
     UsageError
-        The specification does not name ``room``, or an option is unknown, repeated or out of range.
+        The specification names no such place, or an option is unknown, repeated or out of range.
     """
-    options = _parse(spec)
-    fx = _FOCAL_PER_WIDTH * options.width
+    name, *items = spec.split(",")
+    if name not in _PLACES:
+        raise UsageError(
+            f"expected a synthetic scene named room or street, found {name!r} in {spec!r}"
+        )
+    place = _PLACES[name]
+    options = _parse(spec, items, place)
+    fx = place.focal_per_width * options.width
     intrinsics = Intrinsics(fx, fx, (options.width - 1) / 2, (options.height - 1) / 2)
-    flights = [_Flight(options, number) for number in range(options.flights)]
-    times_s = np.arange(options.frames, dtype=np.float64) * _FRAME_TIME_S
-    names = tuple(f"flight-{number:02d}" for number in range(1, options.flights + 1))
+    recordings = [place.record(options, number) for number in range(options.recordings)]
+    times_s = np.arange(options.frames, dtype=np.float64) * recordings[0].frame_time_s
+    names = tuple(f"{place.recording}-{number:02d}" for number in range(1, len(recordings) + 1))
 
     def read_image(index: int) -> Image:
-        flight, frame = divmod(range(options.flights * options.frames)[index], options.frames)
-        return flights[flight].photograph(frame, intrinsics, (options.width, options.height))
+        number, frame = divmod(range(len(recordings) * options.frames)[index], options.frames)
+        return recordings[number].photograph(frame, intrinsics, (options.width, options.height))
 
     return PoseDataset(
-        name="synthetic-room",
-        poses=np.concatenate([flight.poses(times_s) for flight in flights]),
-        sequence=np.repeat(np.arange(options.flights), options.frames),
+        name=f"synthetic-{name}",
+        poses=np.concatenate([recording.poses(times_s) for recording in recordings]),
+        sequence=np.repeat(np.arange(len(recordings)), options.frames),
         sequence_names=names,
         frame_names=tuple(f"{name}/frame-{j:06d}" for name in names for j in range(options.frames)),
         read_image=read_image,
@@ -82,44 +101,70 @@ def open_room(spec: str = "room") -> PoseDataset:
     )
 
 
-def _parse(spec: str) -> _Options:
-    name, *items = spec.split(",")
-    if name != "room":
-        raise UsageError(f"expected a synthetic scene named room, found {name!r} in {spec!r}")
+def _fly(options: _Options, number: int) -> Recording:
+    return Flight(
+        options.seed,
+        number,
+        turn=bool(options.turn),
+        still=options.still,
+        tag_m=options.tag_m,
+    )
+
+
+def _drive(options: _Options, number: int) -> Recording:
+    return Drive(options.seed, number)
+
+
+_PLACES = {
+    # Kinect: 585 px at 640 px, a horizontal field of view of 57 degrees.
+    "room": _Place(
+        "flight",
+        _fly,
+        0.9140625,
+        ("flights", "frames", "size", "seed", "turn", "still", "tag"),
+        _Options(48, 50),
+    ),
+    # Cameras on cars see more: 80 degrees.
+    "street": _Place("drive", _drive, 0.6, ("drives", "frames", "size", "seed"), _Options(10, 200)),
+}
+
+
+def _parse(spec: str, items: list[str], place: _Place) -> _Options:
     values: dict[str, int] = {}
     still: tuple[str, ...] = ()
     tag_m: float | None = None
     for item in items:
         key, _, text = item.partition("=")
+        if key not in place.keys or (key == "still" and still) or (key == "tag" and tag_m):
+            raise UsageError(
+                f"expected an option {'=, '.join(place.keys[:-1])}= or {place.keys[-1]}=, each "
+                f"once, found {item!r} in {spec!r}"
+            )
         if key == "size":
             width, _, height = text.partition("x")
             found = {"width": width, "height": height}
-        elif key in ("flights", "frames", "seed", "turn"):
-            found = {key: text}
-        elif key == "still" and not still:
+        elif key == "still":
             still, found = tuple(text.split("+")), {}
-            if not set(still) <= set(_NAMES):
+            if not set(still) <= set(DEGREES_OF_FREEDOM):
                 raise UsageError(
-                    f"expected still= with names among {'+'.join(_NAMES)}, found {item!r}"
+                    f"expected still= with names among {'+'.join(DEGREES_OF_FREEDOM)}, found "
+                    f"{item!r}"
                 )
-        elif key == "tag" and tag_m is None:
+        elif key == "tag":
             found, tag_m = {}, _edge(text)
             if tag_m is None:
                 raise UsageError(f"expected tag=0.02..0.3 in metres, found {item!r} in {spec!r}")
         else:
-            raise UsageError(
-                "expected an option flights=, frames=, size=, seed=, turn=, still= or tag=, each "
-                "once, found "
-                f"{item!r} in {spec!r}"
-            )
+            found = {"recordings" if key == f"{place.recording}s" else key: text}
         for field, digits in found.items():
             if field in values:
                 raise UsageError(f"expected {key} once, found it twice in {spec!r}")
             low, high = _RANGES[field]
             if not (digits.isascii() and digits.isdigit() and low <= int(digits) <= high):
-                raise UsageError(f"expected {_EXPECTED[key]}, found {item!r} in {spec!r}")
+                expected = _SIZES if key == "size" else f"{key}={low}..{high}"
+                raise UsageError(f"expected {expected}, found {item!r} in {spec!r}")
             values[field] = int(digits)
-    return _Options(**values, still=still, tag_m=tag_m or 0.0)
+    return place.default._replace(**values, still=still, tag_m=tag_m or 0.0)
 
 
 def _edge(text: str) -> float | None:
@@ -132,82 +177,11 @@ def _edge(text: str) -> float | None:
 
 
 _RANGES = {
-    "flights": (1, 1000),
+    "recordings": (1, 1000),
     "frames": (1, 10000),
     "width": (64, 1920),
     "height": (48, 1080),
     "seed": (0, 2**32 - 1),
     "turn": (0, 1),
 }
-_EXPECTED = {
-    "flights": "flights=1..1000",
-    "frames": "frames=1..10000",
-    "size": "size=WIDTHxHEIGHT between 64x48 and 1920x1080",
-    "seed": "seed=0..4294967295",
-    "turn": "turn=0..1",
-}
-
-# ------------------------------------------------------------------------------------- flights
-
-_FRAME_TIME_S = 1 / 30
-_EXPOSURE_S = 1 / 200
-
-# Every degree of freedom is a sum of three sinusoids whose amplitudes add up to its reach: it is
-# smooth, stays within centre +- reach, and has a standard deviation of 0.44 times the reach. The
-# volume is small enough for a small network to learn; the speed is that of a hand-held camera.
-_CENTRE = np.array([0.0, -0.4, 1.3, 0.0, 0.0, 0.0])  # x y z in metres; yaw pitch roll in radians
-_REACH = np.array([0.4, 0.3, 0.15, *np.radians([17.5, 7.5, 4.0])])
-_NAMES = ("x", "y", "z", "yaw", "pitch", "roll")
-# Of a camera that turns round, in rad/s, either way.
-_TURN_RAD_S = 0.6, 1.2
-_TURN_STREAM = 2**20
-_TURNS = {3: np.array([0, 0, 1]), 4: np.array([1, 0, 0]), 5: np.array([0, 0, 1])}
-_LEVEL = quaternion_exp([-math.pi / 2, 0, 0])  # looks along world y, with z up in the image
-_SHARES = np.array([0.5, 0.35, 0.15])
-_RATES_RAD_S = np.array([1.28, 2.72, 4.8])
-
-
-class _Flight:
-    """One camera trajectory over continuous time, its light and its sensor noise."""
-
-    def __init__(self, options: _Options, number: int) -> None:
-        self._entropy = (options.seed, number)
-        self._tag_m = options.tag_m
-        self._still = [_NAMES.index(name) for name in options.still]
-        # Start and rate of the turns, from a stream of their own.
-        around = self._rng(_TURN_STREAM)
-        rate = around.uniform(*_TURN_RAD_S) * around.choice([-1.0, 1.0])
-        self._yaw = (around.uniform(0.0, 2 * math.pi), rate) if options.turn else (0.0, 0.0)
-        rng = self._rng(0)
-        self._rate = _RATES_RAD_S * rng.uniform(0.8, 1.25, (6, 3))
-        self._phase = rng.uniform(0, 2 * math.pi, (6, 3))
-        self._light = Light(rng)
-
-    def _scene(self) -> Scene:
-        return tagged_room(self._tag_m) if self._tag_m else room()
-
-    def _rng(self, stream: int) -> np.random.Generator:
-        return np.random.default_rng((*self._entropy, stream))
-
-    def poses(self, times_s: Floats) -> Floats:
-        """Return ``T_world_camera`` at n times, shape (n, 7): tx ty tz, qx qy qz qw."""
-        angles = self._rate * times_s[:, None, None] + self._phase
-        state = _CENTRE + _REACH * (np.sin(angles) @ _SHARES)
-        state[:, self._still] = _CENTRE[self._still]
-        state[:, 3] += self._yaw[0] + self._yaw[1] * times_s
-        yaw, pitch, roll = (quaternion_exp(state[:, [k]] * axis) for k, axis in _TURNS.items())
-        # Right to left: roll about the optical axis, pitch about the camera's x axis (positive
-        # looks up), the level camera looking along world y, yaw about world z.
-        tilt = quaternion_multiply(pitch, roll)
-        rotation = quaternion_multiply(yaw, quaternion_multiply(_LEVEL, tilt))
-        return np.concatenate([state[:, :3], rotation], axis=1)
-
-    def photograph(self, frame: int, intrinsics: Intrinsics, size: tuple[int, int]) -> Image:
-        """Render a frame with this flight's blur, light and noise, (height, width, 3), BGR."""
-        time_s = frame * _FRAME_TIME_S
-        opening, pose, closing = self.poses(time_s + _EXPOSURE_S * np.array([-0.5, 0.0, 0.5]))
-        sharp = self._scene().render(pose, intrinsics, size)
-        image = motion_blur(sharp, opening, pose, closing, intrinsics)
-        self._light.shade(image, time_s, intrinsics)
-        add_noise(image, self._rng(frame + 1))
-        return as_image(image)
+_SIZES = "size=WIDTHxHEIGHT between 64x48 and 1920x1080"

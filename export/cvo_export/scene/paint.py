@@ -41,14 +41,14 @@ def plain(rng: np.random.Generator, height: int, width: int, colour: Colour) -> 
     return as_image(paint)
 
 
-def _vary(rng: np.random.Generator, colour: Sequence[float], spread: float) -> Colour:
+def vary(rng: np.random.Generator, colour: Sequence[float], spread: float) -> Colour:
     """Return a random colour near another one, with a different brightness and hue."""
     near = np.array(colour) * rng.normal(1, spread) + rng.normal(0, 60 * spread, 3)
     b, g, r = near.clip(8, 247).astype(int).tolist()
     return b, g, r
 
 
-def _vivid(rng: np.random.Generator) -> Colour:
+def vivid(rng: np.random.Generator) -> Colour:
     """Return a random saturated colour of any hue."""
     hsv = np.array([[[rng.integers(180), rng.integers(110, 220), rng.integers(90, 240)]]], np.uint8)
     b, g, r = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].tolist()
@@ -66,10 +66,10 @@ def planks(rng: np.random.Generator, height: int, width: int, colour: Colour) ->
         left = -int(rng.integers(0, 200))
         while left < width:
             right = left + int(rng.integers(150, 420))
-            cv2.rectangle(image, (left, top), (right, bottom), _vary(rng, colour, 0.13), -1)
-            cv2.line(image, (right, top), (right, bottom), _vary(rng, (25, 35, 45), 0.1), 2)
+            cv2.rectangle(image, (left, top), (right, bottom), vary(rng, colour, 0.13), -1)
+            cv2.line(image, (right, top), (right, bottom), vary(rng, (25, 35, 45), 0.1), 2)
             left = right
-        cv2.line(image, (0, top), (width, top), _vary(rng, (25, 35, 45), 0.1), 2)
+        cv2.line(image, (0, top), (width, top), vary(rng, (25, 35, 45), 0.1), 2)
     grain = cv2.resize(noise(rng, height, width // 12 + 2, 24), (width, height))
     return as_image(image * (1 + 0.09 * grain[..., None]))
 
@@ -80,10 +80,10 @@ def tiles(rng: np.random.Generator, height: int, width: int, colour: Colour) -> 
     for top in range(0, height, 48):
         for left in range(0, width, 48):
             tile = (left + 45, top + 45)
-            cv2.rectangle(image, (left + 2, top + 2), tile, _vary(rng, colour, 0.12), -1)
+            cv2.rectangle(image, (left + 2, top + 2), tile, vary(rng, colour, 0.12), -1)
             if rng.random() < 0.3:
                 middle, size = (left + 24, top + 24), int(rng.integers(8, 20))
-                cv2.circle(image, middle, size, _vivid(rng), int(rng.integers(2, 6)), cv2.LINE_AA)
+                cv2.circle(image, middle, size, vivid(rng), int(rng.integers(2, 6)), cv2.LINE_AA)
     return as_image(image * (1 + 0.05 * noise(rng, height, width, 100)[..., None]))
 
 
@@ -97,9 +97,9 @@ def panels(rng: np.random.Generator, height: int, width: int, colour: Colour) ->
         cv2.rectangle(image, (x0, y0), (x1, y1), (30, 35, 40), 2)
         door = image[y0 + 12 : y1 - 12, x0 + 12 : x1 - 12]
         door[:] = as_image(door * rng.uniform(0.75, 1.2, 3).astype(np.float32))
-        cv2.rectangle(image, (x0 + 12, y0 + 12), (x1 - 12, y1 - 12), _vary(rng, colour, 0.3), 3)
+        cv2.rectangle(image, (x0 + 12, y0 + 12), (x1 - 12, y1 - 12), vary(rng, colour, 0.3), 3)
         x, y = x1 - 20 if column % 2 == 0 else x0 + 20, (y0 + y1) // 2 + int(rng.integers(-20, 20))
-        cv2.line(image, (x, y - 12), (x, y + 12), _vary(rng, (210, 215, 220), 0.1), 5, cv2.LINE_AA)
+        cv2.line(image, (x, y - 12), (x, y + 12), vary(rng, (210, 215, 220), 0.1), 5, cv2.LINE_AA)
     return image
 
 
@@ -115,9 +115,9 @@ def books(rng: np.random.Generator, height: int, width: int, colour: Colour) -> 
         while (right := left + int(rng.integers(8, 22))) < width - 8:
             top = bottom - int(room_above * rng.uniform(0.6, 0.97))
             if rng.random() < 0.93:
-                cv2.rectangle(image, (left, top), (right - 1, bottom), _vivid(rng), -1)
+                cv2.rectangle(image, (left, top), (right - 1, bottom), vivid(rng), -1)
                 band = top + int(rng.integers(6, 30))
-                cv2.rectangle(image, (left, band), (right - 1, band + 6), _vivid(rng), -1)
+                cv2.rectangle(image, (left, band), (right - 1, band + 6), vivid(rng), -1)
             left = right
     return image
 
@@ -125,17 +125,17 @@ def books(rng: np.random.Generator, height: int, width: int, colour: Colour) -> 
 def crate(rng: np.random.Generator, height: int, width: int, colour: Colour) -> Image:
     """Paint a wooden crate with a stencilled word."""
     image = planks(rng, height, width, colour)
-    beam = _vary(rng, [0.75 * value for value in colour], 0.1)
+    beam = vary(rng, [0.75 * value for value in colour], 0.1)
     cv2.line(image, (0, height), (width, 0), beam, 24, cv2.LINE_AA)
-    cv2.rectangle(image, (8, 8), (width - 9, height - 9), _vary(rng, beam, 0.12), 18)
+    cv2.rectangle(image, (8, 8), (width - 9, height - 9), vary(rng, beam, 0.12), 18)
     for x in (9, width - 10):
         for y in (9, height - 10):
             cv2.circle(image, (x, y), 4, (40, 40, 40), -1, cv2.LINE_AA)
-    _write(rng, image, (30, 30, 30), 0.45)
+    write(rng, image, (30, 30, 30), 0.45)
     return image
 
 
-def _write(rng: np.random.Generator, image: Image, colour: Colour, at: float) -> None:
+def write(rng: np.random.Generator, image: Image, colour: Colour, at: float) -> None:
     """Write an invented word across the image; ``at`` is the height as a share of the image's."""
     height, width = image.shape[:2]
     syllables = rng.integers((14, 5), size=(2, 2)).tolist()
@@ -156,14 +156,14 @@ def poster(rng: np.random.Generator, height: int, width: int, colour: Colour) ->
         size = max(int(rng.uniform(0.06, 0.24) * min(height, width)), 1)
         kind = rng.integers(3)
         if kind == 0:
-            cv2.circle(image, (x, y), size, _vivid(rng), -1, cv2.LINE_AA)
+            cv2.circle(image, (x, y), size, vivid(rng), -1, cv2.LINE_AA)
         elif kind == 1:
             corners = np.add(rng.integers(-2 * size, 2 * size, (3, 2)), (x, y))
-            cv2.fillPoly(image, [corners.astype(np.int32)], _vivid(rng), cv2.LINE_AA)
+            cv2.fillPoly(image, [corners.astype(np.int32)], vivid(rng), cv2.LINE_AA)
         else:
             end = (int(rng.integers(width)), int(rng.integers(height)))
-            cv2.line(image, (x, y), end, _vivid(rng), max(size // 3, 2), cv2.LINE_AA)
-    _write(rng, image, (245, 245, 245), rng.uniform(0.2, 0.85))
+            cv2.line(image, (x, y), end, vivid(rng), max(size // 3, 2), cv2.LINE_AA)
+    write(rng, image, (245, 245, 245), rng.uniform(0.2, 0.85))
     return image
 
 
@@ -195,11 +195,11 @@ def fabric(rng: np.random.Generator, height: int, width: int, colour: Colour) ->
     while left < width:
         stripe = int(rng.integers(6, 30))
         if rng.random() < 0.55:
-            cv2.rectangle(image, (left, 0), (left + stripe, height), _vary(rng, colour, 0.25), -1)
+            cv2.rectangle(image, (left, 0), (left + stripe, height), vary(rng, colour, 0.25), -1)
         left += stripe
     for _ in range(max(height * width // 12000, 1)):
         x, y = int(rng.integers(width)), int(rng.integers(height))
-        cv2.circle(image, (x, y), int(rng.integers(6, 16)), _vivid(rng), -1, cv2.LINE_AA)
+        cv2.circle(image, (x, y), int(rng.integers(6, 16)), vivid(rng), -1, cv2.LINE_AA)
     return as_image(image * (1 + 0.08 * noise(rng, height, width, 12)[..., None]))
 
 
@@ -210,7 +210,7 @@ def leaves(rng: np.random.Generator, height: int, width: int, colour: Colour) ->
         middle = (int(rng.integers(width)), int(rng.integers(height)))
         size = (int(rng.integers(8, 20)), int(rng.integers(3, 7)))
         turn = float(rng.uniform(0, 180))
-        cv2.ellipse(image, middle, size, turn, 0, 360, _vary(rng, colour, 0.3), -1, cv2.LINE_AA)
+        cv2.ellipse(image, middle, size, turn, 0, 360, vary(rng, colour, 0.3), -1, cv2.LINE_AA)
     return image
 
 

@@ -27,7 +27,8 @@ Pinhole = tuple[float, float, float, float]  # fx fy cx cy in pixels
 _OVERSAMPLING = 2
 _NEAR_M = 0.05
 _EDGE_ON_M = 1e-6
-_TILE_M = 1.3  # large faces are divided into tiles, each with its own texture level
+# Large faces are divided into tiles of this size at least, each with its own texture level.
+_TILE_M, _TILE_TEXELS = 1.3, 100
 
 
 def as_image(values: NDArray[Any]) -> Image:
@@ -72,7 +73,9 @@ class Scene:
         owners: list[int] = []
         quads: list[Floats] = []
         for number, (corner, edges) in enumerate(zip(self._corner, self._edges, strict=True)):
-            tiles = np.ceil(np.linalg.norm(edges, axis=1) / _TILE_M).astype(int)
+            spans = np.linalg.norm(edges, axis=1)
+            texels = np.array(self.faces[number].texture.shape[1::-1])
+            tiles = np.ceil(np.minimum(spans / _TILE_M, texels / _TILE_TEXELS)).astype(int)
             for column, row in np.ndindex(*tiles):
                 uv = np.add([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]], (column, row))
                 quads.append(corner + uv / tiles @ edges)

@@ -6,14 +6,13 @@ World frame: x right, y forward, z up, in metres; the origin is the centre of th
 from __future__ import annotations
 
 import functools
-import math
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cvo_export.scene import paint
+from cvo_export.scene.boxes import Box, cuboid
 from cvo_export.scene.paint import Colour, Paint
 from cvo_export.scene.renderer import Face, Floats, Scene, as_image
 
@@ -21,45 +20,17 @@ ROOM_M = np.array([5.0, 4.0, 2.6])
 _BOX_TEXELS_M = 300
 _LIGHT_TEXELS_M = 40
 
-# Texture axes u and v for each of the six viewing directions (u x v = direction).
-_VIEWS = {
-    "+y": ((1, 0, 0), (0, 0, -1)),
-    "-y": ((-1, 0, 0), (0, 0, -1)),
-    "+x": ((0, -1, 0), (0, 0, -1)),
-    "-x": ((0, 1, 0), (0, 0, -1)),
-    "-z": ((1, 0, 0), (0, -1, 0)),
-    "+z": ((1, 0, 0), (0, 1, 0)),
-}
-# Light on a surface, by the viewing direction from which it is seen.
-_LIGHT = {"+y": 0.97, "-y": 0.8, "+x": 0.8, "-x": 0.9, "-z": 1.06, "+z": 0.6}
-
 # A little in front of the wall, right of the window and above the screen.
 _TAG_CENTRE_M = (0.45, 1.99, 1.32)
-
-_Sides = dict[str, tuple[Floats, Floats, Floats]]  # view -> corner, edge_u and edge_v of a face
-
-
-class _Box(NamedTuple):
-    """A piece of furniture: centre of its base and size in metres, yaw in degrees."""
-
-    base: tuple[float, float, float]
-    size: tuple[float, float, float]
-    yaw: float
-    paint: Paint  # on large vertical sides
-    trim: Paint  # on all other sides
-    colour: Colour
-
-    def sides(self) -> _Sides:
-        """Return the sides, seen from outside."""
-        centre = np.add(self.base, (0, 0, self.size[2] / 2))
-        return _cuboid(centre, np.array(self.size), math.radians(self.yaw), inside=False)
 
 
 @functools.cache
 def room() -> Scene:
     """Return the room with walls, floor, ceiling and furniture; textures are painted only once."""
-    boxes = [_box(np.random.default_rng((2, n)), row) for n, row in enumerate(_FURNITURE)]
-    return Scene([*_shell(), *(face for box in boxes for face in box)])
+    faces = _shell()
+    for number, box in enumerate(_FURNITURE):
+        faces += box.faces(np.random.default_rng((2, number)), _BOX_TEXELS_M)
+    return Scene(faces)
 
 
 @functools.cache
@@ -76,42 +47,10 @@ def tagged_room(edge_m: float) -> Scene:
     return Scene([*room().faces, Face(corner, edges[0], edges[1], paint.tag())])
 
 
-def _cuboid(centre: Floats, size: Floats, yaw: float, inside: bool) -> _Sides:
-    """Return the sides of a box, seen from inside or outside."""
-    turn = np.array(
-        [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]
-    )
-    sides = {}
-    for view, (u, v) in _VIEWS.items():
-        edge_u, edge_v = u * size, v * size
-        depth = np.cross(u, v) * size * (1 if inside else -1)
-        corner = centre + turn @ (depth - edge_u - edge_v) / 2
-        sides[view] = (corner, turn @ edge_u, turn @ edge_v)
-    return sides
-
-
-def _box(rng: np.random.Generator, row: _Box) -> list[Face]:
-    """Build the visible sides of a piece of furniture."""
-    faces = []
-    for view, (corner, u, v) in row.sides().items():
-        if view == "+z" and row.base[2] == 0:
-            continue
-        width, height = (
-            max(round(float(np.linalg.norm(edge)) * _BOX_TEXELS_M), 4) for edge in (u, v)
-        )
-        upright = view not in ("-z", "+z")
-        large = upright and min(width, height) > 0.15 * _BOX_TEXELS_M
-        texture = (row.paint if large else row.trim)(rng, height, width, row.colour)
-        shade = np.linspace(1.05, 0.8 if upright else 1.05, height, dtype=np.float32)
-        lit = texture * (_LIGHT[view] * shade[:, None, None])
-        faces.append(Face(corner, u, v, as_image(lit)))
-    return faces
-
-
 def _shell() -> list[Face]:
     """Build walls, floor and ceiling, shaded in corners and near furniture."""
     faces = []
-    sides = _cuboid(np.array([0, 0, ROOM_M[2] / 2]), ROOM_M, 0, inside=True)
+    sides = cuboid(np.array([0, 0, ROOM_M[2] / 2]), ROOM_M, 0, inside=True)
     for number, (view, (corner, u, v)) in enumerate(sides.items()):
         rng = np.random.default_rng((1, number))
         spans = np.array([np.linalg.norm(u), np.linalg.norm(v)])
@@ -166,33 +105,33 @@ _WOOD = (60, 110, 170)
 
 _FURNITURE = (
     # A table with objects on it.
-    _Box((0.1, 1.05, 0.71), (1.2, 0.6, 0.05), 0, paint.planks, paint.planks, (80, 140, 200)),
-    _Box((-0.44, 0.81, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
-    _Box((0.64, 0.81, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
-    _Box((-0.44, 1.29, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
-    _Box((0.64, 1.29, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
-    _Box((-0.27, 1.12, 0.76), (0.3, 0.22, 0.2), 24, paint.crate, paint.planks, (90, 150, 190)),
-    _Box((0.42, 1.08, 0.76), (0.28, 0.2, 0.07), -12, paint.fabric, paint.poster, (60, 60, 190)),
-    _Box((0.44, 1.08, 0.83), (0.24, 0.18, 0.05), 9, paint.fabric, paint.poster, (190, 120, 50)),
-    _Box((0.08, 0.95, 0.76), (0.09, 0.09, 0.11), 33, paint.plain, paint.plain, (70, 200, 235)),
-    _Box((0.1, 1.2, 0.76), (0.13, 0.13, 0.1), 15, paint.tiles, paint.plain, (70, 90, 170)),
-    _Box((0.1, 1.2, 0.86), (0.2, 0.2, 0.24), 40, paint.leaves, paint.leaves, (60, 140, 70)),
+    Box((0.1, 1.05, 0.71), (1.2, 0.6, 0.05), 0, paint.planks, paint.planks, (80, 140, 200)),
+    Box((-0.44, 0.81, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
+    Box((0.64, 0.81, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
+    Box((-0.44, 1.29, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
+    Box((0.64, 1.29, 0), (0.07, 0.07, 0.71), 0, paint.plain, paint.plain, _WOOD),
+    Box((-0.27, 1.12, 0.76), (0.3, 0.22, 0.2), 24, paint.crate, paint.planks, (90, 150, 190)),
+    Box((0.42, 1.08, 0.76), (0.28, 0.2, 0.07), -12, paint.fabric, paint.poster, (60, 60, 190)),
+    Box((0.44, 1.08, 0.83), (0.24, 0.18, 0.05), 9, paint.fabric, paint.poster, (190, 120, 50)),
+    Box((0.08, 0.95, 0.76), (0.09, 0.09, 0.11), 33, paint.plain, paint.plain, (70, 200, 235)),
+    Box((0.1, 1.2, 0.76), (0.13, 0.13, 0.1), 15, paint.tiles, paint.plain, (70, 90, 170)),
+    Box((0.1, 1.2, 0.86), (0.2, 0.2, 0.24), 40, paint.leaves, paint.leaves, (60, 140, 70)),
     # Along the front wall: a low cabinet with a screen, and shelves above it.
-    _Box((-0.05, 1.82, 0), (1.7, 0.34, 0.5), 0, paint.panels, paint.planks, (120, 90, 60)),
-    _Box((-0.2, 1.88, 0.5), (0.95, 0.06, 0.64), 0, paint.screen, paint.plain, (220, 120, 120)),
-    _Box((1.15, 1.88, 1.42), (0.8, 0.24, 0.04), 0, paint.planks, paint.planks, _WOOD),
-    _Box((1.0, 1.89, 1.46), (0.42, 0.18, 0.26), 0, paint.books, paint.plain, _WOOD),
-    _Box((1.38, 1.88, 1.46), (0.16, 0.16, 0.22), 28, paint.leaves, paint.leaves, (80, 170, 120)),
-    _Box((1.1, 1.7, 0), (0.36, 0.36, 0.42), 18, paint.fabric, paint.fabric, (60, 160, 220)),
+    Box((-0.05, 1.82, 0), (1.7, 0.34, 0.5), 0, paint.panels, paint.planks, (120, 90, 60)),
+    Box((-0.2, 1.88, 0.5), (0.95, 0.06, 0.64), 0, paint.screen, paint.plain, (220, 120, 120)),
+    Box((1.15, 1.88, 1.42), (0.8, 0.24, 0.04), 0, paint.planks, paint.planks, _WOOD),
+    Box((1.0, 1.89, 1.46), (0.42, 0.18, 0.26), 0, paint.books, paint.plain, _WOOD),
+    Box((1.38, 1.88, 1.46), (0.16, 0.16, 0.22), 28, paint.leaves, paint.leaves, (80, 170, 120)),
+    Box((1.1, 1.7, 0), (0.36, 0.36, 0.42), 18, paint.fabric, paint.fabric, (60, 160, 220)),
     # In the corners: a cupboard with a crate on top, and a white cupboard with a box on top.
-    _Box((-1.98, 1.7, 0), (0.85, 0.56, 1.9), 0, paint.panels, paint.plain, (150, 170, 120)),
-    _Box((-2.0, 1.66, 1.9), (0.55, 0.4, 0.24), 8, paint.crate, paint.plain, (60, 80, 150)),
-    _Box((2.08, 1.62, 0), (0.66, 0.66, 1.65), 0, paint.panels, paint.plain, (215, 220, 222)),
-    _Box((2.08, 1.62, 1.65), (0.4, 0.3, 0.28), -20, paint.poster, paint.plain, (60, 130, 220)),
+    Box((-1.98, 1.7, 0), (0.85, 0.56, 1.9), 0, paint.panels, paint.plain, (150, 170, 120)),
+    Box((-2.0, 1.66, 1.9), (0.55, 0.4, 0.24), 8, paint.crate, paint.plain, (60, 80, 150)),
+    Box((2.08, 1.62, 0), (0.66, 0.66, 1.65), 0, paint.panels, paint.plain, (215, 220, 222)),
+    Box((2.08, 1.62, 1.65), (0.4, 0.3, 0.28), -20, paint.poster, paint.plain, (60, 130, 220)),
     # On the left: a column and a floor lamp.
-    _Box((-1.5, 0.85, 0), (0.24, 0.24, 2.6), 0, paint.tiles, paint.plain, (90, 120, 210)),
-    _Box((-1.1, 1.5, 0), (0.04, 0.04, 1.4), 0, paint.plain, paint.plain, (45, 42, 40)),
-    _Box((-1.1, 1.5, 1.4), (0.34, 0.34, 0.32), 22, paint.fabric, paint.plain, (150, 215, 245)),
+    Box((-1.5, 0.85, 0), (0.24, 0.24, 2.6), 0, paint.tiles, paint.plain, (90, 120, 210)),
+    Box((-1.1, 1.5, 0), (0.04, 0.04, 1.4), 0, paint.plain, paint.plain, (45, 42, 40)),
+    Box((-1.1, 1.5, 1.4), (0.34, 0.34, 0.32), 22, paint.fabric, paint.plain, (150, 215, 245)),
     # A lamp over the table.
-    _Box((0.25, 1.05, 1.95), (0.36, 0.36, 0.25), 35, paint.tiles, paint.plain, (120, 210, 245)),
+    Box((0.25, 1.05, 1.95), (0.36, 0.36, 0.25), 35, paint.tiles, paint.plain, (120, 210, 245)),
 )
