@@ -58,7 +58,8 @@ def lap() -> _Lap:
     speed = _SPEED_M_S - (_SPEED_M_S - _CORNER_SPEED_M_S) * curvature / bend.max()
     time_s = np.concatenate([[0.0], np.cumsum(step_m / speed)])
     curvature = np.append(curvature, curvature[0])
-    return _Lap(place, heading, curvature, time_s, np.arange(len(heading)) * step_m)
+    distance = np.arange(len(heading), dtype=np.float64) * step_m
+    return _Lap(place, heading, curvature, time_s, distance)
 
 
 class Drive(Recording):
