@@ -1,16 +1,20 @@
 """How exact ``reconstruct`` is, and how long it takes.
 
-    python bench/reconstruct.py redkitchen FOLDER [--frames 100 300] [--json FILE]
+    python bench/reconstruct.py trajectory DATASET [--frames 100 300] [--json FILE]
     python bench/reconstruct.py tag [--json FILE]
 
-``redkitchen`` reconstructs the images of a 7-Scenes folder without their poses, with its intrinsics
-of 585 pixels, by each mapper: registered share, error of the positions after the best similarity,
-seconds. ``tag`` reconstructs the synthetic room with a tag of 0.2 m: the error of the scale.
+``trajectory`` reconstructs the images of a data set without their poses and compares positions
+after the best similarity: with the data set's intrinsics for each number of images, and for the
+first number also by the incremental mapper and with estimated intrinsics. ``apart_cm`` is the
+median distance between the map and the first one on the images of both: it does not depend on the
+data set's poses. ``tag`` reconstructs the synthetic room with a tag of 0.2 m: the error of the
+scale.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -24,94 +28,137 @@ from provenance import write_result
 from cvo_edge.engine.cores import allowed_cores
 from cvo_export.datasets import PoseDataset, open_dataset
 from cvo_export.progress import show_progress
-from cvo_export.reconstruct.mapping import Mapper
-from cvo_export.reconstruct.model import read_model
+from cvo_export.reconstruct.model import Model, read_model
 from cvo_export.reconstruct.recordings import frame_of
 from cvo_export.reconstruct.run import Options, reconstruct
 from cvo_export.reconstruct.similarity import between_points
 
-KITCHEN = "585,585,319.5,239.5"
+Array = NDArray[np.float64]
+
 ROOM, EVERY, TAG_M = "synthetic:room,flights=1,frames=300,size=640x480,tag=0.2", 6, 0.2
+# Most images are then a frame or two apart, so that the number of images decides.
+STEP = 0.01
 
 
 def measured(
-    folders: list[str], truth: dict[tuple[str, int], NDArray[np.float64]], options: Options
-) -> dict[str, Any]:
+    folders: list[str], truth: dict[tuple[str, int], Array], options: Options
+) -> tuple[dict[str, Any], Model]:
     """Reconstruct once; ``truth`` has the position (3,) of each frame by recording and number."""
     with TemporaryDirectory() as work, show_progress() as progress:
         scene = Path(work) / "scene"
-        start = perf_counter()
+        load = os.getloadavg()[0]
+        before, start = os.times(), perf_counter()
         report = reconstruct(folders, scene, options, progress)
-        seconds = perf_counter() - start
+        seconds, after = perf_counter() - start, os.times()
         model = read_model(scene / "sparse" / "0")
     true = np.array([truth[frame_of(name)] for name in model.names])
     found = between_points(model.poses[:, :3], true)
     error = 100 * np.linalg.norm(found.points(model.poses[:, :3]) - true, axis=1)
-    return {
+    figures = {
         "images": report.images,
         "registered": report.registered,
         "mapper": report.mapper,
         "points": report.points,
         "reprojection_px": report.error_px,
+        "camera": report.camera,
         "median_error_cm": float(np.median(error)),
         "largest_error_cm": float(error.max()),
         "scale_error": found.scale - 1.0 if options.tag_size_m else None,
+        "scale_spread": report.scale.spread,
         "seconds": seconds,
+        "processor_seconds": sum(after[:4]) - sum(before[:4]),
         "cores": allowed_cores(),
+        "load_average": [load, os.getloadavg()[0]],
     }
+    # Positions in metres, to compare maps with one another.
+    return figures, model._replace(poses=found.poses(model.poses))
 
 
-def positions(dataset: PoseDataset) -> dict[tuple[str, int], NDArray[np.float64]]:
-    """Return the position of each frame by sequence and number in its name."""
-    found = {}
-    for name, pose in zip(dataset.frame_names, dataset.poses, strict=True):
-        sequence, frame = name.split("/")
-        found[sequence, int(frame.rpartition("-")[2])] = pose[:3]
-    return found
+def apart_cm(one: Model, two: Model) -> float:
+    """Return the median distance of two maps after the best similarity, on their common images."""
+    common = sorted(set(one.names) & set(two.names))
+    ours, theirs = (
+        np.array([model.poses[model.names.index(name), :3] for name in common])
+        for model in (one, two)
+    )
+    off = between_points(ours, theirs).points(ours) - theirs
+    return 100 * float(np.median(np.linalg.norm(off, axis=1)))
 
 
-def kitchen(folder: Path, frames: list[int]) -> dict[str, Any]:
-    """Measure redkitchen with each number of images and each mapper."""
-    truth = positions(open_dataset(f"7scenes:{folder}"))
-    folders = [str(folder / name) for name in sorted({sequence for sequence, _ in truth})]
-    mappers: tuple[Mapper, ...] = ("global", "incremental")
-    return {
-        f"{mapper}, {most} images": measured(
-            folders, truth, Options(intrinsics=KITCHEN, step=0.01, most=most, mappers=(mapper,))
+def written(
+    dataset: PoseDataset, rows: range, folder: Path
+) -> tuple[list[str], dict[tuple[str, int], Array]]:
+    """Write images of a data set, a folder for each sequence; returns folders and true positions.
+
+    The truth has the position (3,) of each frame by folder and number.
+    """
+    truth: dict[tuple[str, int], Array] = {}
+    counts: dict[str, int] = {}
+    for row in rows:
+        name = dataset.sequence_names[dataset.sequence[row]].replace("/", "-")
+        number = counts[name] = counts.get(name, -1) + 1
+        path = folder / name / f"{number:06d}.png"
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), dataset.read_image(row), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        truth[name, number] = dataset.poses[row, :3]
+    return [str(folder / name) for name in counts], truth
+
+
+def intrinsics_of(dataset: PoseDataset) -> str:
+    """Return what ``--intrinsics`` takes; raises SystemExit if the data set states no camera."""
+    if dataset.intrinsics is None or dataset.lens.distortion == "equidistant":
+        raise SystemExit(f"{dataset.name}: expected known intrinsics without a fisheye lens")
+    return ",".join(map(str, (*dataset.intrinsics, *dataset.lens.coefficients)))
+
+
+def trajectory(name: str, frames: list[int]) -> dict[str, Any]:
+    """Measure a data set with each number of images, and other options with the first number."""
+    dataset = open_dataset(name)
+    known = intrinsics_of(dataset)
+    found: dict[str, Any] = {}
+    first: Model | None = None
+    with TemporaryDirectory() as work:
+        folders, truth = written(dataset, range(len(dataset)), Path(work))
+        runs = {
+            f"{most} images": Options(intrinsics=known, step=STEP, most=most) for most in frames
+        }
+        small = runs[f"{frames[0]} images"]
+        runs["incremental mapper"] = Options(
+            intrinsics=known, step=STEP, most=small.most, mappers=("incremental",)
         )
-        for most in frames
-        for mapper in mappers
-    }
+        runs["estimated intrinsics"] = Options(step=STEP, most=small.most)
+        for what, options in runs.items():
+            found[what], model = measured(folders, truth, options)
+            first = first or model
+            found[what]["apart_cm"] = apart_cm(model, first)
+    return found
 
 
 def tag() -> dict[str, Any]:
     """Measure the scale that a tag in the synthetic room gives, with known and own intrinsics."""
     room = open_dataset(ROOM)
-    rows = range(0, len(room), EVERY)
-    truth = {("room", number): room.poses[row, :3] for number, row in enumerate(rows)}
-    known = ",".join(map(str, room.intrinsics or ()))
     with TemporaryDirectory() as work:
-        folder = Path(work) / "room"
-        folder.mkdir()
-        for number, row in enumerate(rows):
-            cv2.imwrite(str(folder / f"{number:06d}.png"), room.read_image(row))
+        folders, truth = written(room, range(0, len(room), EVERY), Path(work))
         return {
-            name: measured([str(folder)], truth, Options(intrinsics=given, tag_size_m=TAG_M))
-            for name, given in (("known intrinsics", known), ("estimated intrinsics", None))
+            what: measured(folders, truth, Options(intrinsics=given, tag_size_m=TAG_M))[0]
+            for what, given in (
+                ("known intrinsics", intrinsics_of(room)),
+                ("estimated intrinsics", None),
+            )
         }
 
 
 def main() -> None:
     """Run the measurement that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["redkitchen", "tag"])
-    parser.add_argument("folder", nargs="?", type=Path)
+    parser.add_argument("what", choices=["trajectory", "tag"])
+    parser.add_argument("dataset", nargs="?")
     parser.add_argument("--frames", nargs="+", type=int, default=[100, 300])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    if given.what == "redkitchen" and given.folder is None:
-        parser.error("redkitchen needs its folder")
-    found = tag() if given.what == "tag" else kitchen(given.folder, given.frames)
+    if given.what == "trajectory" and given.dataset is None:
+        parser.error("trajectory needs a data set")
+    found = tag() if given.what == "tag" else trajectory(given.dataset, given.frames)
     for name, figures in found.items():
         print(name, *(f"{key} {value}" for key, value in figures.items()), sep="\n  ")
     if given.json is not None:
