@@ -387,6 +387,32 @@ def test_options_are_refused_before_anything_is_written(tmp_path, options, expec
     assert not (tmp_path / "scene").exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (
+            {},
+            r"walk: expected two or more frames 0\.04 image widths of motion apart .* found 1 of 3",
+        ),
+        ({"intrinsics": "585,585"}, "walk: expected two or more frames"),
+        ({"distance": ("walk/frame-0", "walk/frame-1", 1.0), "intrinsics": "5"}, "intrinsics: exp"),
+        (
+            {"distance": ("walk/frame-0", "walk/frame-9", 1.0)},
+            "expected a readable frame of 0 to 2",
+        ),
+    ],
+)
+def test_recordings_that_cannot_be_used_leave_no_scene(tmp_path, options, expected):
+    pytest.importorskip("pycolmap")
+    (tmp_path / "walk").mkdir()
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / "walk" / f"{number}.png"), np.zeros((48, 64, 3), np.uint8))
+    scene = tmp_path / "scene"
+    with pytest.raises((SourceError, UsageError), match=expected):
+        reconstruct([str(tmp_path / "walk")], scene, Options(**options), ignore)
+    assert not scene.exists()
+
+
 def test_recordings_are_named_once_and_cameras_refused(tmp_path):
     for parent in ("one", "two"):
         (tmp_path / parent / "my walk").mkdir(parents=True)

@@ -104,12 +104,21 @@ def reconstruct(paths: Sequence[str], scene: Path, options: Options, progress: P
     recordings = find_recordings(paths)
     _check_names(asked, recordings)
     stages = Stages(layout, recordings)
-    motions = {
-        each.name: measure(each, layout.work / f"motion-{each.name}.json", progress)
-        for each in recordings
-    }
-    used = _images(layout, stages, recordings, motions, options, asked, progress)
-    groups = _groups(motions, used, options.intrinsics)
+    try:
+        motions = {
+            each.name: measure(each, layout.work / f"motion-{each.name}.json", progress)
+            for each in recordings
+        }
+        used = choose(motions, options.step, options.most, asked)
+        groups = _groups(motions, used, options.intrinsics)
+    except (SourceError, UsageError):
+        # Nothing is worth continuing.
+        if stages.new:
+            stages.remove()
+        raise
+    if stages.begin("frames", used):
+        _write_frames(layout, recordings, used, progress)
+        stages.end("frames")
     names = [each.name for each in used]
     if stages.begin("features", (groups, FEATURES)):
         in_process(layout, partial(extract, layout, groups), progress)
@@ -172,32 +181,21 @@ def _check_names(asked: Sequence[str], recordings: Sequence[Recording]) -> None:
             )
 
 
-def _images(
-    layout: Layout,
-    stages: Stages,
-    recordings: Sequence[Recording],
-    motions: dict[str, Motion],
-    options: Options,
-    asked: Sequence[str],
-    progress: Progress,
-) -> list[Used]:
-    """Choose the frames and write their images; the frames that options name are used, too."""
-    used = choose(motions, options.step, options.most, asked)
-    if stages.begin("frames", used):
-        for each in recordings:
-            numbers = [
-                n for name, n in map(frame_of, (one.name for one in used)) if name == each.name
-            ]
-            write_images(each, numbers, layout.images, progress)
-        write_json(layout.frames, used)
-        stages.end("frames")
-    return used
+def _write_frames(
+    layout: Layout, recordings: Sequence[Recording], used: Sequence[Used], progress: Progress
+) -> None:
+    found = [frame_of(each.name) for each in used]
+    for each in recordings:
+        numbers = [number for name, number in found if name == each.name]
+        write_images(each, numbers, layout.images, progress)
+    write_json(layout.frames, used)
 
 
 def choose(motions: dict[str, Motion], step: float, most: int, asked: Sequence[str]) -> list[Used]:
     """Return the frames to use, by recording and time: see ``choice``, and those asked for.
 
-    Raises UsageError if a frame that is asked for does not exist or cannot be read.
+    Raises UsageError if a frame that is asked for does not exist or cannot be read, SourceError if
+    fewer than two frames are left.
     """
     readable = {name: motion.readable for name, motion in motions.items()}
     measured = {
@@ -217,6 +215,12 @@ def choose(motions: dict[str, Motion], step: float, most: int, asked: Sequence[s
             last = len(motions[name].sources) - 1
             raise UsageError(f"{frame}: expected a readable frame of 0 to {last}, found none")
         numbers[name].add(number)
+    if sum(map(len, numbers.values())) < 2:
+        frames = sum(map(len, readable.values()))
+        raise SourceError(
+            f"{', '.join(motions)}: expected two or more frames {step:g} image widths of motion "
+            f"apart (--step), found 1 of {frames}; record a camera that moves"
+        )
     return [
         Used(
             image_name(name, number),

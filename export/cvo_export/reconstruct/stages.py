@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -81,7 +82,7 @@ class _State(Struct):
 
 
 class Stages:
-    """The stages of a scene and the options they were done with."""
+    """The stages of a scene and the options they were done with; ``new`` if it began just now."""
 
     def __init__(self, layout: Layout, recordings: list[Recording]) -> None:
         """Open a new or an interrupted scene.
@@ -91,7 +92,8 @@ class Stages:
         self._layout = layout
         self._file = layout.work / "state.json"
         self._before = ""
-        if self._file.exists():
+        self.new = not self._file.exists()
+        if not self.new:
             self._state = read_json(self._file, _State, "the state of a reconstruction")
             _check_same(layout.scene, self._state.recordings, recordings)
             return
@@ -136,6 +138,12 @@ class Stages:
     def repeat(self, stage: StageName) -> None:
         """Forget a stage and all later ones, so that they begin again."""
         self._forget(STAGES[STAGES.index(stage) :])
+
+    def remove(self) -> None:
+        """Remove what was noted, and the scene's folder if nothing else is in it."""
+        remove(self._layout.work)
+        with suppress(OSError):
+            self._layout.scene.rmdir()
 
     def _forget(self, stages: tuple[StageName, ...]) -> None:
         for name in stages:
