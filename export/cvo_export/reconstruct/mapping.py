@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import signal
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -229,6 +230,7 @@ def _child(sender: Connection, task: Callable[[Progress], None], log: Path) -> N
     # The parent ends this process; COLMAP writes its messages to the log.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(descriptor, 2)
     import pycolmap
@@ -249,6 +251,13 @@ def _child(sender: Connection, task: Callable[[Progress], None], log: Path) -> N
         os._exit(1)
     else:
         sender.send(None)
+
+
+def _end_with_parent() -> None:
+    # A parent that was killed cannot end this process, and the same command starts another one.
+    if (parent := multiprocessing.parent_process()) is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _death(layout: Layout, code: int | None, log: Path) -> CvoError:
