@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from functools import partial
 
 import cv2
@@ -437,40 +438,78 @@ def test_one_recording_has_one_image_size(tmp_path):
 # ---------------------------------------------------------------------------------- end to end
 
 
-def test_a_rendered_walk_becomes_a_metric_map(tmp_path):
-    """Ten images of the room: all placed, metres within 1 %, and a second call does nothing."""
-    pycolmap = pytest.importorskip("pycolmap")
+WAY = Options(tag_size_m=0.2, intrinsics="292.5,292.5,159.5,119.5")
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory):
+    """Ten images of the room with a tag, their true poses, and their reconstruction."""
+    pytest.importorskip("pycolmap")
+    folder = tmp_path_factory.mktemp("walked")
     dataset = open_dataset("synthetic:room,flights=1,frames=140,size=320x240,tag=0.2")
-    walk = tmp_path / "walk"
-    walk.mkdir()
-    rows = range(0, 140, 14)
+    rows = list(range(0, 140, 14))
+    (folder / "walk").mkdir()
     for row in rows:
-        cv2.imwrite(str(walk / f"{row}.png"), dataset.read_image(row))
-    scene, options = (
-        tmp_path / "scene",
-        Options(tag_size_m=0.2, intrinsics="292.5,292.5,159.5,119.5"),
-    )
-    report = reconstruct([str(walk)], scene, options, ignore)
+        cv2.imwrite(str(folder / "walk" / f"{row}.png"), dataset.read_image(row))
+    report = reconstruct([str(folder / "walk")], folder / "scene", WAY, ignore)
+    return folder, dataset.poses[rows], report
+
+
+def test_a_rendered_walk_becomes_a_metric_map(walked):
+    """All ten images are placed, metres within 1 %."""
+    folder, true, report = walked
+    scene = folder / "scene"
     assert report.registered == 1.0
     assert report.unit == "metres"
     assert report.doubts == ()
     assert read_report(scene) == report
     assert "map: 10 of 10 images placed (100.0%)" in "\n".join(report_lines(report))
-
     model = read_model(scene / "sparse" / "0")
     assert model.names == tuple(recordings.image_name("walk", number) for number in range(10))
     assert all((scene / "images" / name).is_file() for name in model.names)
-    assert pycolmap.Reconstruction(scene / "sparse" / "0").num_points3D() == report.points > 300
-    true = dataset.poses[list(rows)]
     found = similarity.between_points(model.poses[:, :3], true[:, :3])
     assert found.scale == pytest.approx(1.0, abs=0.01)
     errors = np.linalg.norm(found.points(model.poses[:, :3]) - true[:, :3], axis=1)
     assert np.median(errors) < 0.005
 
+
+def test_a_scene_is_a_data_set_that_keeps_its_points(walked):
+    folder, _, report = walked
+    found = open_dataset(f"colmap:{folder / 'scene'}")
+    assert len(found) == 10
+    assert found.intrinsics == (292.5, 292.5, 159.5, 119.5)
+    assert np.allclose(found.poses, read_model(folder / "scene" / "sparse" / "0").poses, atol=1e-9)
+    pycolmap = pytest.importorskip("pycolmap")
+    kept = pycolmap.Reconstruction(folder / "scene" / "sparse" / "0")
+    assert kept.num_points3D() == report.points > 300
+
+
+def test_another_scale_reads_the_finished_map(walked, tmp_path):
+    folder, true, report = walked
+    scene = shutil.copytree(folder / "scene", tmp_path / "scene")
     told = []
     ends = ("walk/frame-000000", "walk/frame-000009")
     metres = float(np.linalg.norm(true[0, :3] - true[9, :3]))
-    other = msgspec.structs.replace(options, tag_size_m=None, distance=(*ends, metres))
-    again = reconstruct([str(walk)], scene, other, lambda *stage: told.append(stage))
+    other = msgspec.structs.replace(WAY, tag_size_m=None, distance=(*ends, metres))
+    again = reconstruct([str(folder / "walk")], scene, other, lambda *stage: told.append(stage))
     assert told == []
     assert again.scale.factor == pytest.approx(report.scale.factor, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("damaged", "stage", "expected"),
+    [
+        ("model/images.bin", "mapping", "model: expected the map, found damaged files; repeat"),
+        ("mapping.json", "mapping", "model: expected the map, found damaged files; repeat"),
+        ("database.db", "features", "expected the keypoints, found damaged files; repeat"),
+    ],
+)
+def test_damaged_work_is_made_anew_by_the_next_call(walked, tmp_path, damaged, stage, expected):
+    folder, _, _ = walked
+    scene = shutil.copytree(folder / "scene", tmp_path / "scene")
+    (scene / "work" / damaged).write_bytes(b"damaged " * 999)
+    with pytest.raises(SourceError, match=expected):
+        reconstruct([str(folder / "walk")], scene, WAY, ignore)
+    state = msgspec.json.decode((scene / "work" / "state.json").read_bytes())
+    assert stage not in state["stages"]
+    assert not (scene / "work" / damaged).exists()

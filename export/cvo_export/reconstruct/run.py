@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,6 +22,7 @@ from cvo_export.reconstruct.choice import chosen, fitting_step
 from cvo_export.reconstruct.mapping import (
     FEATURES,
     Group,
+    Mapped,
     Mapper,
     build,
     extract,
@@ -120,6 +123,7 @@ def reconstruct(paths: Sequence[str], scene: Path, options: Options, progress: P
         _write_frames(layout, recordings, used, progress)
         stages.end("frames")
     names = [each.name for each in used]
+    _check_database(layout, stages)
     if stages.begin("features", (groups, FEATURES)):
         in_process(layout, partial(extract, layout, groups), progress)
         stages.end("features")
@@ -131,9 +135,10 @@ def reconstruct(paths: Sequence[str], scene: Path, options: Options, progress: P
         task = partial(build, layout, len(names), given, options.mappers)
         in_process(layout, task, progress)
         stages.end("mapping")
-    scale, model = _scaled(layout, options, known, progress)
+    found, mapped = _read_map(layout, stages)
+    scale, model = _scaled(layout, found, options, known, progress)
     lengths = {name: len(motion.sources) for name, motion in motions.items()}
-    report = make_report(lengths, names, model, read_mapped(layout), scale, intrinsics_known=given)
+    report = make_report(lengths, names, model, mapped, scale, intrinsics_known=given)
     write_json(scene / "report.json", report)
     return report
 
@@ -258,11 +263,48 @@ def _camera(intrinsics: str | None, size: tuple[int, int]) -> Camera | None:
     return None if intrinsics is None else read_intrinsics(intrinsics, *size)
 
 
+def _check_database(layout: Layout, stages: Stages) -> None:
+    """Raise SourceError if the database is missing or damaged; the same call then makes it anew."""
+    if not stages.done("features"):
+        return
+    damaged = not layout.database.exists()
+    if not damaged:
+        try:
+            with closing(sqlite3.connect(layout.database)) as opened:
+                opened.execute("SELECT count(*) FROM images").fetchone()
+        except sqlite3.OperationalError:
+            # Locked, or the disk is full: COLMAP will say so.
+            return
+        except sqlite3.DatabaseError:
+            damaged = True
+    if damaged:
+        stages.repeat("features")
+        raise SourceError(_damaged(layout.database, "the keypoints"))
+
+
+def _read_map(layout: Layout, stages: Stages) -> tuple[Model, Mapped]:
+    """Return the finished map; raises SourceError if damaged, and the same call maps again."""
+    try:
+        return read_model(layout.model), read_mapped(layout)
+    except (OSError, ValueError, LookupError, RuntimeError):
+        stages.repeat("mapping")
+        raise SourceError(_damaged(layout.model, "the map")) from None
+
+
+def _damaged(path: Path, what: str) -> str:
+    return (
+        f"{path}: expected {what}, found damaged files; repeat the command, which makes them anew"
+    )
+
+
 def _scaled(
-    layout: Layout, options: Options, known: dict[str, Array] | None, progress: Progress
+    layout: Layout,
+    model: Model,
+    options: Options,
+    known: dict[str, Array] | None,
+    progress: Progress,
 ) -> tuple[Scale, Model]:
     """Write the map in its final world frame; returns the scale and the map."""
-    model = read_model(layout.model)
     if known is not None:
         scale, similarity = align_to_poses(model, known)
     else:

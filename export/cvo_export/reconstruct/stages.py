@@ -135,6 +135,10 @@ class Stages:
         self._state.stages[stage].done = True
         write_json(self._file, self._state)
 
+    def done(self, stage: StageName) -> bool:
+        """Whether a stage is done, with whatever options."""
+        return (found := self._state.stages.get(stage)) is not None and found.done
+
     def repeat(self, stage: StageName) -> None:
         """Forget a stage and all later ones, so that they begin again."""
         self._forget(STAGES[STAGES.index(stage) :])
