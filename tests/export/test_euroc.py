@@ -184,7 +184,7 @@ def test_recordings_of_one_room_are_one_data_set(tmp_path):
         (
             "T_BS: {data: [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}",
             "T_BS, 16 numbers of a rigid transform, found "
-            "{'data': [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}",
+            "[2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]",
         ),
     ],
 )

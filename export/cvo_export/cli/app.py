@@ -17,7 +17,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Train a pose network with bounds, export it to one ONNX graph, calibrate and evaluate "
     "it. DATASET is FORMAT:PATH, e.g. 7scenes:scenes/redkitchen or synthetic:room; the formats are "
-    "7scenes, rgbd-scenes, tum, kitti, euroc, rosbag and synthetic.",
+    "7scenes, 12scenes, ace, scannet, rgbd-scenes, tum, tum-vi, kitti, euroc, colmap, nerfstudio, "
+    "rosbag and synthetic.",
 )
 
 DATA, NETWORK, TRAINING = "Data", "Network", "Training"

@@ -5,25 +5,33 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from cvo_edge.errors import UsageError
+from cvo_export.datasets.ace import open_ace
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.colmap import open_colmap
 from cvo_export.datasets.euroc import open_euroc
 from cvo_export.datasets.kitti import open_kitti
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
 from cvo_export.datasets.rosbag import open_rosbag
+from cvo_export.datasets.scannet import open_scannet
 from cvo_export.datasets.seven_scenes import open_seven_scenes
 from cvo_export.datasets.synthetic import open_synthetic
 from cvo_export.datasets.transforms import open_nerfstudio
 from cvo_export.datasets.tum import open_tum
+from cvo_export.datasets.tum_vi import open_tum_vi
+from cvo_export.datasets.twelve_scenes import open_twelve_scenes
 
 __all__ = ["FORMATS", "Intrinsics", "Lens", "PoseDataset", "open_dataset"]
 
 FORMATS: dict[str, Callable[[str], PoseDataset]] = {
     "7scenes": open_seven_scenes,
+    "12scenes": open_twelve_scenes,
+    "ace": open_ace,
+    "scannet": open_scannet,
     "rgbd-scenes": open_rgbd_scenes,
     "tum": open_tum,
     "kitti": open_kitti,
     "euroc": open_euroc,
+    "tum-vi": open_tum_vi,
     "colmap": open_colmap,
     "nerfstudio": open_nerfstudio,
     "rosbag": open_rosbag,

@@ -14,32 +14,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from cvo_edge.camera import Distortion
-from cvo_edge.errors import SourceError
-from cvo_edge.ground_truth import matrix_to_pose
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
 from cvo_export.datasets.poses import camera_pose, quaternion_pose
+from cvo_export.datasets.sensors import pinhole, read_document, rigid_transform
 from cvo_export.datasets.stamps import add_associated
-from cvo_export.datasets.tables import read_rows, read_text
+from cvo_export.datasets.tables import read_rows
 
 Array = NDArray[np.float64]
 
 _IMAGES = "mav0/cam0/data.csv"
 _CAMERA = "mav0/cam0/sensor.yaml"
 _POSES = "mav0/state_groundtruth_estimate0/data.csv"
-
-_MODELS: dict[str, Distortion] = {
-    "radial-tangential": "radial_tangential",
-    "equidistant": "equidistant",
-}
 
 # One period of the ground truth (200 Hz). Camera and IMU are triggered together and the ground
 # truth uses the IMU's stamps, so the nearest pose belongs to the image and needs no interpolation.
@@ -89,39 +80,9 @@ def _add_recording(frames: FrameList, name: str, folder: Path, T_body_camera: Ar
 
 def _read_camera(path: Path) -> tuple[tuple[Intrinsics, Lens] | None, Array]:
     """Return the intrinsics with the lens, and ``T_body_camera``, shape (4, 4), metres."""
-    text = read_text(path, "a camera's T_BS and intrinsics")
-    # OpenCV's tools require a first line %YAML:1.0, which is not valid YAML.
-    text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
-    try:
-        document: Any = yaml.safe_load(text)
-    # Invalid dates raise ValueError, and deeply nested brackets raise RecursionError.
-    except (yaml.YAMLError, ValueError, RecursionError):
-        document = None
-    if not isinstance(document, dict):
-        raise SourceError(f"{path}: expected YAML with T_BS and intrinsics, found other text")
+    document = read_document(path, "T_BS")
     T_BS = document.get("T_BS")
-    matrix = _numbers(T_BS.get("data") if isinstance(T_BS, dict) else T_BS, 16)
-    if matrix is None or matrix_to_pose(matrix.reshape(4, 4)) is None:
-        found = " ".join(str(T_BS).split())[:80]
-        raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid transform, found {found}")
-    intrinsics = _numbers(document.get("intrinsics"), 4)
-    model = _MODELS.get(str(document.get("distortion_model")))
-    coefficients = _numbers(document.get("distortion_coefficients"), 4)
-    pinhole = document.get("camera_model") == "pinhole"
-    if intrinsics is None or model is None or coefficients is None or not pinhole:
-        return None, matrix.reshape(4, 4)
-    camera = Intrinsics(*intrinsics.tolist())
-    if not camera.possible:
-        raise SourceError(
-            f"{path}: expected finite intrinsics with positive focal lengths, found "
-            f"{intrinsics.tolist()}"
-        )
-    return (camera, Lens(model, tuple(coefficients.tolist()))), matrix.reshape(4, 4)
-
-
-def _numbers(values: object, count: int) -> Array | None:
-    try:
-        numbers = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    return numbers if numbers.shape == (count,) else None
+    T_body_camera = rigid_transform(
+        path, "T_BS", T_BS.get("data") if isinstance(T_BS, dict) else T_BS
+    )
+    return pinhole(path, document, "distortion_coefficients"), T_body_camera

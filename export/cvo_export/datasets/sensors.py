@@ -1,0 +1,78 @@
+"""Cameras in YAML files: ``sensor.yaml`` of the ASL layout and Kalibr's ``camchain.yaml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from cvo_edge.camera import Distortion
+from cvo_edge.errors import SourceError
+from cvo_edge.ground_truth import matrix_to_pose
+from cvo_export.datasets.base import Intrinsics, Lens
+from cvo_export.datasets.tables import read_text
+
+Array = NDArray[np.float64]
+
+_MODELS: dict[str, Distortion] = {
+    "radial-tangential": "radial_tangential",
+    "radtan": "radial_tangential",
+    "equidistant": "equidistant",
+}
+
+
+def read_document(path: Path, key: str) -> dict[Any, Any]:
+    """Read a file that describes a camera; raises SourceError, which names the expected ``key``."""
+    text = read_text(path, f"a camera's {key} and intrinsics")
+    # OpenCV's tools require a first line %YAML:1.0, which is not valid YAML.
+    text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
+    try:
+        document: Any = yaml.safe_load(text)
+    # Invalid dates raise ValueError, and deeply nested brackets raise RecursionError.
+    except (yaml.YAMLError, ValueError, RecursionError):
+        document = None
+    if not isinstance(document, dict):
+        raise SourceError(f"{path}: expected YAML with {key} and intrinsics, found other text")
+    return document
+
+
+def rigid_transform(path: Path, key: str, values: object) -> Array:
+    """Return the transform (4, 4) of 16 numbers or four rows; raises SourceError for others."""
+    matrix = _numbers(values, 16)
+    if matrix is None or matrix_to_pose(matrix.reshape(4, 4)) is None:
+        found = " ".join(str(values).split())[:80]
+        raise SourceError(f"{path}: expected {key}, 16 numbers of a rigid transform, found {found}")
+    return matrix.reshape(4, 4)
+
+
+def pinhole(path: Path, camera: dict[Any, Any], lens: str) -> tuple[Intrinsics, Lens] | None:
+    """Return intrinsics and lens, whose coefficients have the key ``lens``.
+
+    Returns None for a camera that is no pinhole or has another distortion than radial-tangential
+    and equidistant. Raises SourceError for intrinsics that no camera has.
+    """
+    intrinsics = _numbers(camera.get("intrinsics"), 4)
+    model = _MODELS.get(str(camera.get("distortion_model")))
+    coefficients = _numbers(camera.get(lens), 4)
+    if intrinsics is None or model is None or coefficients is None:
+        return None
+    if camera.get("camera_model") != "pinhole":
+        return None
+    found = Intrinsics(*intrinsics.tolist())
+    if not found.possible:
+        raise SourceError(
+            f"{path}: expected finite intrinsics with positive focal lengths, found "
+            f"{intrinsics.tolist()}"
+        )
+    return found, Lens(model, tuple(coefficients.tolist()))
+
+
+def _numbers(values: object, count: int) -> Array | None:
+    try:
+        numbers = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return numbers.reshape(count) if numbers.size == count else None

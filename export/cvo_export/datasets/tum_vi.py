@@ -1,0 +1,120 @@
+"""TUM-VI (Schubert et al. 2018), its layout for EuRoC and DSO: ``mav0`` and ``dso``.
+
+``mav0/cam0/data.csv`` lists ``timestamp,filename`` of the images in ``mav0/cam0/data``, grey, 16
+bits. ``mav0/mocap0/data.csv`` lists ``timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z``: integer nanoseconds,
+metres and a quaternion, scalar first. This is the pose of the IMU in the frame of the motion
+capture system, 120 a second; ``dso/gt_imu.csv`` has the same columns. ``T_cam_imu`` in
+``dso/camchain.yaml`` (Kalibr) maps points from the IMU's frame to the camera's, so
+
+    T_world_camera = T_world_imu @ inverse(T_cam_imu)
+
+The motion capture system hangs in one room: of recordings that leave it, only the start and the end
+have poses. The lens is a fisheye (equidistant); its distortion is read, not corrected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.errors import SourceError
+from cvo_edge.ground_truth import matrix_to_pose
+from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
+from cvo_export.datasets.folders import only_camera, recordings
+from cvo_export.datasets.frames import FrameList
+from cvo_export.datasets.poses import quaternion_pose
+from cvo_export.datasets.sensors import pinhole, read_document, rigid_transform
+from cvo_export.datasets.tables import read_rows
+from cvo_export.datasets.track import Track
+
+_IMAGES = "mav0/cam0/data.csv"
+_POSES = ("mav0/mocap0/data.csv", "dso/gt_imu.csv")
+_CAMERA = "dso/camchain.yaml"
+
+# More than half a period of the motion capture system (120 Hz).
+_MAX_STAMP_DIFFERENCE_NS = 5_000_000
+# Poses further apart belong to different visits of the room.
+_GAP_NS = 1_000_000_000
+
+_INVALID = np.full(7, np.nan)
+
+
+def open_tum_vi(path: str) -> PoseDataset:
+    """Read one recording (the folder that contains ``mav0``), or all recordings in a folder.
+
+    Poses are interpolated to the images' stamps, because the cameras do not run with the motion
+    capture system. Frames with no pose within 5 ms, an invalid pose or a missing image are left out
+    and counted; ``chosen`` says which share of a recording has ground truth, and in how many parts,
+    unless it has it throughout. All recordings share the frame of the motion capture system.
+
+    Raises SourceError if a file is missing or malformed, recordings come from different cameras,
+    or no frame has a pose.
+    """
+    root = Path(path)
+    frames = FrameList(root)
+    cameras: dict[str, tuple[Intrinsics, Lens] | None] = {}
+    partial: list[str] = []
+    for name, folder in recordings(root, _IMAGES).items():
+        cameras[name], T_imu_camera = _read_camera(folder / _CAMERA)
+        partial += _add_recording(frames, name, folder, T_imu_camera)
+    dataset = replace(frames.dataset(root.resolve().name), chosen="; ".join(partial))
+    camera = only_camera(root, cameras)
+    if camera is None:
+        return dataset
+    return replace(dataset, intrinsics=camera[0], lens=camera[1])
+
+
+def _add_recording(
+    frames: FrameList, name: str, folder: Path, T_imu_camera: NDArray[np.float64]
+) -> list[str]:
+    """Add a recording; return what is to be said of a ground truth with gaps."""
+    rows = sorted(
+        (row.nanoseconds(), row.fields[1])
+        for row in read_rows(folder / _IMAGES, "timestamp,filename", separator=",")
+    )
+    track = _read_track(folder)
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in rows], np.int64)
+    T_world_imu, near = track.at(stamps_ns, _MAX_STAMP_DIFFERENCE_NS)
+    images = (folder / _IMAGES).with_name("data")
+    for (stamp_ns, file), T, found in zip(rows, T_world_imu @ T_imu_camera, near, strict=True):
+        if found:
+            image = images / file
+            frames.add(name, image.stem, image, matrix_to_pose(T), stamp_ns)
+        else:
+            frames.skip(f"no pose within {_MAX_STAMP_DIFFERENCE_NS / 1e9:g} s")
+    if near.all():
+        return []
+    steps_ns = np.diff(track.stamps_ns)
+    parts = 1 + int((steps_ns > _GAP_NS).sum())
+    covered_s = steps_ns[steps_ns <= _GAP_NS].sum() / 1e9
+    whole_s = (stamps_ns[-1] - stamps_ns[0]) / 1e9
+    return [
+        f"{name} has ground truth for {covered_s:.1f} of {whole_s:.1f} s, in {parts} "
+        f"part{'' if parts == 1 else 's'}"
+    ]
+
+
+def _read_track(folder: Path) -> Track:
+    path = next((folder / each for each in _POSES if (folder / each).is_file()), folder / _POSES[0])
+    rows = read_rows(path, "timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z", separator=",", more=True)
+    if not rows:
+        raise SourceError(f"{path}: expected poses of the motion capture system, found none")
+    poses = []
+    for row in rows:
+        values = row.numbers(1)
+        pose = quaternion_pose(values[:3], np.roll(values[3:], -1))
+        poses.append(_INVALID if pose is None else pose)
+    return Track.of([row.nanoseconds() for row in rows], poses)
+
+
+def _read_camera(path: Path) -> tuple[tuple[Intrinsics, Lens] | None, NDArray[np.float64]]:
+    """Return the intrinsics with the lens of ``cam0``, and ``T_imu_camera``, (4, 4), metres."""
+    camera = read_document(path, "cam0 with T_cam_imu").get("cam0")
+    if not isinstance(camera, dict):
+        raise SourceError(f"{path}: expected cam0 with T_cam_imu and intrinsics, found no cam0")
+    T_camera_imu = rigid_transform(path, "T_cam_imu", camera.get("T_cam_imu"))
+    T_imu_camera = np.asarray(np.linalg.inv(T_camera_imu), np.float64)
+    return pinhole(path, camera, "distortion_coeffs"), T_imu_camera
