@@ -26,7 +26,7 @@ $(DEMO_VENV)/.installed: pyproject.toml $(RUNTIME)
 $(VENV)/.installed: pyproject.toml export/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet $(TORCH_PIP_OPTIONS) torch torchvision
-	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable "./export[plot,ray,rosbag]"
+	$(VENV)/bin/python -m pip install --quiet --editable ".[test,check]" --editable "./export[plot,ray,reconstruct,rosbag]"
 	@touch $@
 
 demo: $(DEMO_VENV)/.installed $(addprefix demo-,$(METHODS)) ## install the runtime without torch and run the demonstration of every method

@@ -18,7 +18,7 @@ FOLDER = Path(__file__).resolve().parent
 ROOTS = {
     "runtime.txt": ("cvo-edge[openvino,sign]", "pip install -c constraints/runtime.txt ."),
     "export.txt": (
-        "cvo-export[plot,ray,rosbag]",
+        "cvo-export[plot,ray,reconstruct,rosbag]",
         "pip install -c constraints/export.txt . ./export",
     ),
 }
