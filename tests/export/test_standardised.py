@@ -8,7 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from cvo_edge.pose import Chart
-from cvo_export.networks.standardised import STILL_M, STILL_RAD, PoseDecoder, Target, fit_target
+from cvo_export.datasets.motion import STILL_M, STILL_RAD
+from cvo_export.networks.standardised import PoseDecoder, Target, fit_target
 
 
 def _poses(rotations: Rotation, seed: int = 0) -> np.ndarray:

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from cvo_edge.errors import SinkError, UsageError
+from cvo_export.datasets.motion import MAX_SPREAD_RAD
 from cvo_export.networks.baselines.split import SplitConfig
-from cvo_export.networks.standardised import MAX_SPREAD_RAD
 from cvo_export.training import features
 from cvo_export.training.features import ModelImages
 from cvo_export.training.loop import train

@@ -42,14 +42,12 @@ from cvo_edge.heads import HEADS, Candidate, Head
 from cvo_edge.heads.checked import check_tensors
 from cvo_edge.pose import Chart
 from cvo_edge.vocabulary import Joint, Precision, Provider, Rule
+from cvo_export.datasets.motion import MAX_SPREAD_RAD
 
 Array = NDArray[np.float64]
 
 WORLD_FRAME, CAMERA_FRAME = "world", "camera"
 
-# With a larger spread about the mean rotation, tangent coordinates come close to their
-# discontinuity at pi.
-MAX_SPREAD_RAD = 2.0
 # Least half-width in the normalised score, in standard deviations of each DoF.
 HALF_WIDTH_FLOOR = 0.01
 _LEAST_DEVIATION = 1e-6

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +15,12 @@ from cvo_edge.programs.options import examples
 from cvo_edge.vocabulary import Scope
 from cvo_export.cli.app import DatasetArgument, app, opened
 from cvo_export.vocabulary import Subset
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from cvo_export.datasets import PoseDataset
 
 
 @app.command(
@@ -137,10 +144,48 @@ def render(
     print(f"{folder}: {count} frames of {sequence}")
 
 
-@app.command()
-def dataset(dataset: DatasetArgument) -> None:
-    """Describe a data set: frames, skipped frames and why, sequences, camera, extent."""
+@app.command(
+    epilog=examples(
+        "cvo-export dataset 7scenes:scenes/redkitchen",
+        "cvo-export dataset tum:freiburg1_room --picture room.png",
+    )
+)
+def dataset(
+    dataset: DatasetArgument,
+    picture: Annotated[
+        Path | None,
+        typer.Option(help="Draw the trajectory into a new .png, .svg or .pdf (extra [plot])."),
+    ] = None,
+) -> None:
+    """Describe a data set, and say which splits and confidences it supports.
+
+    Frames, skipped frames and why, camera, extent, speed, up axis, rates, gaps, whether
+    the images agree with the poses, and what looks like wrong units, directions or axes.
+    """
+    from cvo_edge.files import whole_file
+    from cvo_export.datasets.picture import check_picture, draw
+
+    if picture is None:
+        _describe(dataset)
+        return
+    check_picture(picture, "picture")
+    # Opened first: a picture that cannot be written is refused before any work.
+    with whole_file(picture) as stream:
+        found, roles = _describe(dataset)
+        draw(found, stream, picture.suffix, roles)
+    print(f"picture     {picture}")
+
+
+def _describe(dataset: str) -> tuple[PoseDataset, Mapping[str, NDArray[np.int64]]]:
+    """Print what a data set is and supports; return it with the roles of its default split."""
+    from cvo_export.bundles.supported import supported, supported_text
+    from cvo_export.data.splits import default_kind
     from cvo_export.datasets import open_dataset
     from cvo_export.datasets.describe import describe
 
-    print(*describe(open_dataset(dataset)), sep="\n")
+    found = open_dataset(dataset)
+    print(*describe(found), sep="\n")
+    splits = supported(found)
+    print(*supported_text(found, splits), sep="\n")
+    usual = next(each for each in splits if each.kind == default_kind(found))
+    return found, {} if usual.split is None else usual.split.roles

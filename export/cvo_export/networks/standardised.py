@@ -15,14 +15,9 @@ from torch import Tensor, nn
 from cvo_edge import geometry
 from cvo_edge.bundle.format import StillDof
 from cvo_edge.pose import Chart
-from cvo_export.bundles.draft import MAX_SPREAD_RAD
+from cvo_export.datasets.motion import MAX_SPREAD_RAD, deviation_floor
 
 Array = NDArray[np.float64]
-
-# A degree of freedom that moves less than this share of the largest of its kind, or than this many
-# metres or radians, stands still: its unit is this floor.
-_STILL_SHARE = 0.01
-STILL_M, STILL_RAD = 1e-4, 5e-3
 
 
 @dataclass(frozen=True)
@@ -100,12 +95,7 @@ def fit_target(poses: Array) -> Target:
     coordinates = Chart("tangent_reference", reference).coordinates(poses, poses)
     spread = float(np.linalg.norm(coordinates[:, 3:], axis=1).max())
     deviation = coordinates.std(axis=0)
-    floor = np.concatenate(
-        [
-            np.full(3, max(least, _STILL_SHARE * float(part.max())))
-            for part, least in ((deviation[:3], STILL_M), (deviation[3:], STILL_RAD))
-        ]
-    )
+    floor = deviation_floor(deviation)
     still = deviation < floor
     deviation = np.maximum(deviation, floor)
     if spread <= MAX_SPREAD_RAD:

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from cvo_edge.camera import Camera
 from cvo_edge.errors import UsageError
-from cvo_export.bundles.draft import MAX_SPREAD_RAD
 from cvo_export.data.place import Place
 from cvo_export.data.sparse_map import SparseMap, read_sparse_map, sparse_map, write_sparse_map
 from cvo_export.data.splits import (
@@ -32,6 +31,7 @@ from cvo_export.data.splits import (
     training_frames,
 )
 from cvo_export.datasets import PoseDataset, open_dataset
+from cvo_export.datasets.motion import MAX_SPREAD_RAD
 from cvo_export.networks.heads import Setting
 from cvo_export.networks.heads.base import Examples, L, Schedule
 from cvo_export.networks.methods import TRAINABLE
