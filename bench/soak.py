@@ -68,7 +68,8 @@ def main() -> None:
         Odometer.load(demonstration(METHOD, "int8"), mode="throughput") as odometer,
         Sink(os.devnull, "jsonl") as sink,
     ):
-        summary = RunSummary(odometer.chart.dof, 0.9, "marginal", with_truth=True)
+        truth = open_ground_truth(CLIP)
+        summary = RunSummary(odometer.chart.dof, 0.9, "marginal", truth=truth)
 
         def write(estimate: PoseInterval) -> None:
             sink.write(estimate)
@@ -78,8 +79,7 @@ def main() -> None:
                 readings.append({**memory_mib(), "descriptors": open_files, "threads": threads})
                 print(f"{estimate.seq + 1:>9} frames: {readings[-1]}", flush=True)
 
-        truth = open_ground_truth(CLIP)
-        run(odometer, Cycled(count), write, summary=summary, truth=truth)
+        run(odometer, Cycled(count), write, summary=summary)
     tenth = max(1, len(readings) // 10)
 
     def growth(key: str) -> float:

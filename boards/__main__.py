@@ -40,9 +40,9 @@ from cvo_edge.bundle.format import CALIBRATION_FILE, Calibration
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.engine.cores import allowed_cores
 from cvo_edge.errors import CvoError
-from cvo_edge.ground_truth import MATRIX_SUFFIX, read_pose_matrix
 from cvo_edge.output.records import read_records
 from cvo_edge.pose import Chart
+from cvo_edge.trajectories.poses import MATRIX_SUFFIX, read_pose_matrix
 
 CONFIDENCE = 0.9
 

@@ -1,99 +1,84 @@
-"""Ground-truth poses from files: 7-Scenes ``.pose.txt`` folders and TUM trajectories."""
+"""Ground-truth poses from files, matched with the frames of a run."""
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge import geometry
 from cvo_edge.errors import SourceError
 from cvo_edge.estimate import PoseInterval
-from cvo_edge.files import read_regular_file
 from cvo_edge.input.image_files import frame_name
+from cvo_edge.trajectories.poses import MATRIX_SUFFIX, read_pose_matrices
+from cvo_edge.trajectories.trajectory import Skipped, Trajectory, nearest_stamp
+from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS, read_tum
 
 Array = NDArray[np.float64]
-
-MATRIX_SUFFIX = ".pose.txt"
-
-# Frames match the nearest ground-truth stamp within this bound, as in the TUM tools.
-MAX_STAMP_DIFFERENCE_NS = 20_000_000
-
-_MAX_BYTES, _MAX_MATRIX_BYTES = 256 << 20, 1 << 16
+Key = int | str
 
 
-def read_pose_matrix(path: Path) -> Array | None:
-    """Read a 4x4 camera-to-world matrix in metres -> pose (7,), or None if it is invalid.
-
-    Recordings mark lost tracking by files without 16 numbers or with an invalid matrix (see
-    ``matrix_to_pose``).
-    """
-    try:
-        content = read_regular_file(path, _MAX_MATRIX_BYTES, SourceError, links=True)
-        T = np.array(content.decode("ascii").split(), dtype=np.float64)
-    except (SourceError, ValueError):
-        return None
-    return matrix_to_pose(T.reshape(4, 4)) if T.size == 16 else None
-
-
-def matrix_to_pose(T: Array) -> Array | None:
-    """Homogeneous matrix (4, 4) in metres -> pose (7,), or None if it is invalid.
-
-    The rotation is made orthonormal (recorded ones deviate by up to 4e-4). A matrix is invalid if
-    it is not finite or its rotation part is more than 0.01 away from a rotation.
-    """
-    if not np.isfinite(T).all():
-        return None
-    R = geometry.nearest_rotation(T[:3, :3])
-    if np.abs(R - T[:3, :3]).max() > 0.01 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
-        return None
-    return np.concatenate([T[:3, 3], geometry.matrix_to_quaternion(R)])
-
-
-def seconds_to_ns(text: str) -> int:
-    """Decimal seconds as text -> integer nanoseconds; raises ValueError if it is not a number."""
-    seconds, _, fraction = text.partition(".")
-    if seconds.isdecimal() and (fraction.isdecimal() or not fraction):
-        # A double resolves present-day stamps only to 200 ns, so the digits are parsed.
-        return int(seconds) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
-    try:
-        return round(float(text) * 1e9)
-    except OverflowError:
-        raise ValueError(text) from None
-
-
-def nearest_stamp(stamps_ns: Sequence[int], stamp_ns: int, bound_ns: int) -> int | None:
-    """Return the index of the nearest ascending stamp (the earlier of two), None if too far."""
-    right = bisect_left(stamps_ns, stamp_ns)
-    nearest = min(
-        range(max(0, right - 1), min(right + 1, len(stamps_ns))),
-        key=lambda index: abs(stamps_ns[index] - stamp_ns),
-        default=None,
-    )
-    if nearest is None or abs(stamps_ns[nearest] - stamp_ns) > bound_ns:
-        return None
-    return nearest
-
-
+@dataclass(frozen=True)
 class GroundTruth:
-    """True poses for comparison with estimates; see ``open_ground_truth``."""
+    """True poses for comparison with estimates; see ``open_ground_truth``.
 
-    def __init__(self, by_name: dict[str, Array], stamps_ns: list[int], poses: list[Array]) -> None:
-        self._by_name = by_name
-        self._stamps_ns = stamps_ns
-        self._poses = poses
+    Attributes
+    ----------
+    path
+        What was read.
+    by
+        Whether the keys of ``trajectory`` are the stamps of frames or their names.
+    trajectory
+        The poses ``T_world_camera``.
+    bound_ns
+        Largest difference between the stamps of a frame and its pose.
+    """
+
+    path: Path
+    by: Literal["stamp", "name"]
+    trajectory: Trajectory[Any]
+    bound_ns: int = MAX_STAMP_DIFFERENCE_NS
 
     def pose_of(self, estimate: PoseInterval) -> Array | None:
         """Return the true ``T_world_camera`` (7,) of an estimate's frame, or None."""
-        if self._by_name:
-            return self._by_name.get(frame_name(estimate.source))
-        if estimate.stamp_ns is None:
+        key = self.key_of(estimate)
+        if key is None:
             return None
-        nearest = nearest_stamp(self._stamps_ns, estimate.stamp_ns, MAX_STAMP_DIFFERENCE_NS)
-        return None if nearest is None else self._poses[nearest]
+        if self.by == "stamp":
+            index = nearest_stamp(self.trajectory.keys, int(key), self.bound_ns)
+        else:
+            index = self._index.get(key)
+        return None if index is None else self.trajectory.poses[index]
+
+    def key_of(self, estimate: PoseInterval) -> Key | None:
+        """Return what a pose must have in common with an estimate's frame; None if it is unknown.
+
+        This is the stamp in nanoseconds, or the name.
+        """
+        return estimate.stamp_ns if self.by == "stamp" else frame_name(estimate.source)
+
+    @property
+    def skipped(self) -> Skipped:
+        """What the file holds without giving a pose."""
+        return self.trajectory.skipped
+
+    def spans(self, first: Key | None, last: Key | None) -> str:
+        """Return the keys of frames, given the first and the last one, beside those of the poses.
+
+        None means that the frames have no keys.
+        """
+        keys = self.trajectory.keys
+        poses = f"poses {_span(self.by, keys[0], keys[-1])}"
+        if first is None or last is None:
+            return f"frames without a {self.by}, {poses}"
+        return f"frames {_span(self.by, first, last)}, {poses}"
+
+    @cached_property
+    def _index(self) -> dict[Key, int]:
+        return {key: index for index, key in enumerate(self.trajectory.keys)}
 
 
 def open_ground_truth(path: Path) -> GroundTruth:
@@ -106,54 +91,11 @@ def open_ground_truth(path: Path) -> GroundTruth:
             f"{path}: no such file; expected a TUM trajectory or a folder of *{MATRIX_SUFFIX}"
         )
     if path.is_dir():
-        found = {
-            file.name.removesuffix(MATRIX_SUFFIX): read_pose_matrix(file)
-            for file in sorted(path.glob("*" + MATRIX_SUFFIX))
-        }
-        by_name = {name: pose for name, pose in found.items() if pose is not None}
-        if not by_name:
-            raise SourceError(
-                f"{path}: expected files *{MATRIX_SUFFIX} with a pose, found no valid file"
-            )
-        return GroundTruth(by_name, [], [])
-    return GroundTruth({}, *_read_tum(path))
+        return GroundTruth(path, "name", read_pose_matrices(path))
+    return GroundTruth(path, "stamp", read_tum(path))
 
 
-def _read_tum(path: Path) -> tuple[list[int], list[Array]]:
-    try:
-        content = read_regular_file(path, _MAX_BYTES, SourceError, links=True)
-        lines = content.decode("utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise SourceError(f"{path}: expected a TUM trajectory, found {error}") from None
-    stamps: list[int] = []
-    poses: list[Array] = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        fields = line.split()
-        try:
-            values = np.array(fields, dtype=np.float64)
-            stamp = seconds_to_ns(fields[0])
-        except ValueError:
-            values = np.empty(0)
-        if values.size != 8 or not np.isfinite(values).all() or not _is_rotation(values[4:]):
-            raise SourceError(
-                f"{path}: expected eight numbers stamp tx ty tz qx qy qz qw, found {line!r} "
-                f"in line {number}"
-            )
-        if stamps and stamp <= stamps[-1]:
-            raise SourceError(
-                f"{path}: expected increasing stamps, found {fields[0]} in line {number}"
-            )
-        stamps.append(stamp)
-        quaternion = geometry.quaternion_normalise(values[4:])
-        poses.append(np.concatenate([values[1:4], quaternion]))
-    if not stamps:
-        raise SourceError(f"{path}: expected a TUM trajectory, found no poses")
-    return stamps, poses
-
-
-def _is_rotation(quaternion: Array) -> bool:
-    """Whether a quaternion can be normalised."""
-    with np.errstate(over="ignore"):
-        return 0.0 < float(quaternion @ quaternion) < np.inf
+def _span(by: str, first: Key, last: Key) -> str:
+    if by == "stamp":
+        return f"at {int(first) / 1e9:.3f} .. {int(last) / 1e9:.3f} s"
+    return f"{first} .. {last}"

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from cvo_edge.errors import GateError, SinkError, SourceError, UsageError
+from cvo_edge.errors import GateError, SourceError, UsageError
 from cvo_edge.files import refuse_overwriting, write_text
 from cvo_edge.process import guarded, say
+from cvo_edge.programs.examine import cache, doctor, inspect, schema, verify
 from cvo_edge.programs.options import (
     INTERVALS,
     REPORT,
@@ -158,7 +159,7 @@ def run(
                 f"--region: expected a bundle of mcqr, scr or fused and the joint scope, found "
                 f"{odometer.calibration.method} and {scope}"
             )
-        summary = RunSummary(odometer.chart.dof, confidence, scope, with_truth=truth is not None)
+        summary = RunSummary(odometer.chart.dof, confidence, scope, truth=truth)
         watched = output != "-" and not quiet
         header = header_of(
             odometer.calibration,
@@ -175,7 +176,6 @@ def run(
                         frames,
                         sink.write,
                         summary=summary,
-                        truth=truth,
                         labels=Labels(odometer, labelled, label_delay) if labelled else None,
                         max_frames=max_frames,
                         expect_motion=expect_motion,
@@ -187,6 +187,10 @@ def run(
     if summary.statuses["invalid"] == summary.frames:
         raise SourceError(
             f"{shown(source)}: expected at least one valid frame, found none in {summary.frames}"
+        )
+    if truth is not None and not summary.matched:
+        raise SourceError(
+            f"{ground_truth}: expected true poses of the frames, found {summary.match_text(truth)}"
         )
 
 
@@ -286,87 +290,8 @@ def drift(
         raise GateError(f"drift: expected a martingale of at most {max_martingale:g}, {found}")
 
 
-@app.command()
-def verify(
-    bundle: BundleArgument,
-    threads: ThreadsOption = None,
-    public_key: PublicKeyOption = None,
-    timeout: Annotated[
-        float, typer.Option(help="Seconds allowed for loading and self-test.")
-    ] = 60.0,
-) -> None:
-    """Check every digest of a bundle, load it and run its self-test on this machine.
-
-    The self-test runs on the model and on its cached copy, if there is one,
-    in a separate process with limits of time and memory.
-    """
-    from cvo_edge.programs.verify import verify_bundle
-
-    verdict = verify_bundle(bundle, threads=threads, timeout_s=timeout, public_key=public_key)
-    print(verdict.line())
-
-
-@app.command()
-def inspect(bundle: BundleArgument, as_json: JsonOption = False) -> None:
-    """Show a bundle: method, model, thresholds and the calibration behind them."""
-    import msgspec
-
-    from cvo_edge.bundle.reading import read_calibration
-    from cvo_edge.programs.inspect import inspect_lines
-
-    calibration = read_calibration(bundle)
-    if as_json:
-        print(json.dumps(msgspec.to_builtins(calibration), indent=1))
-    else:
-        print(*inspect_lines(calibration), sep="\n")
-
-
-@app.command()
-def schema() -> None:
-    """Print the JSON Schema of calibration.json."""
-    from cvo_edge.programs.inspect import calibration_schema
-
-    print(json.dumps(calibration_schema(), indent=1))
-
-
-@app.command()
-def doctor(as_json: JsonOption = False) -> None:
-    """Show processor, cores, memory and versions of this machine."""
-    from cvo_edge.programs.inspect import doctor_lines
-    from cvo_edge.programs.measure import environment, memory_mib
-
-    report = {**environment(), "memory_mib": memory_mib()}
-    if as_json:
-        print(json.dumps(report, indent=1))
-    else:
-        print(*doctor_lines(report), sep="\n")
-
-
-@app.command()
-def cache(
-    clear: Annotated[bool, typer.Option("--clear", help="Remove all copies.")] = False,
-    as_json: JsonOption = False,
-) -> None:
-    """List the optimised models of this machine (in $CVO_EDGE_CACHE or ~/.cache)."""
-    import msgspec
-
-    from cvo_edge.engine.model_cache import ModelCache
-    from cvo_edge.programs.inspect import cache_lines
-
-    found = ModelCache.default()
-    if clear:
-        obstacle = found.obstacle()
-        if obstacle is not None:
-            raise SinkError(f"{found.folder}: {obstacle}")
-        removed = found.clear()
-        report = {"folder": str(found.folder), "removed": removed}
-        print(json.dumps(report) if as_json else f"{found.folder}: {removed} removed")
-        return
-    if as_json:
-        entries = [msgspec.to_builtins(entry) for entry in found.entries()]
-        print(json.dumps({"folder": str(found.folder), "models": entries}, indent=1))
-    else:
-        print(*cache_lines(found), sep="\n")
+for command in (verify, inspect, schema, doctor, cache):
+    app.command()(command)
 
 
 def _model_cache(wanted: bool) -> ModelCache | None:

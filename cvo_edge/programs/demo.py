@@ -63,14 +63,14 @@ def demo(bundle: Path, picture: Path) -> None:
         Sink("-", "table") as table,
     ):
         name, digest = odometer.calibration.name, odometer.calibration.digest
-        summary = RunSummary(odometer.chart.dof, _CONFIDENCE, _SCOPE, with_truth=True)
+        summary = RunSummary(odometer.chart.dof, _CONFIDENCE, _SCOPE, truth=truth)
 
         def write(estimate: PoseInterval) -> None:
             if len(estimates) < _ROWS:
                 table.write(estimate)
             estimates.append(estimate)
 
-        run(odometer, open_source(str(CLIP)), write, summary=summary, truth=truth)
+        run(odometer, open_source(str(CLIP)), write, summary=summary)
         expected = expected_coverage(digest)
         print("...", *summary.lines(), sep="\n")
         if expected:

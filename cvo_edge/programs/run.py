@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.camera_check import LensEstimate
 from cvo_edge.estimate import Drift, PoseInterval, Status
-from cvo_edge.ground_truth import GroundTruth
+from cvo_edge.ground_truth import GroundTruth, Key
 from cvo_edge.input.frame import Source
 from cvo_edge.input.image_files import ImageFiles, left_out_text
 from cvo_edge.monitor.adaptation import Adapted
@@ -32,20 +32,20 @@ _WORTH_A_LOOK = 0.02
 class RunSummary:
     """Counts, latencies and, with ground truth, coverage, in constant memory.
 
-    ``width_sum`` sums the widths of bounded frames, without gaps; ``disjoint`` counts frames with a
-    gap in some degree of freedom; ``skipped`` counts frames dropped for a newer one; ``matched``
-    counts frames that have a true pose, ``compared`` those of status ok among them, and ``covered``
-    those whose set holds the true value, per degree of freedom; ``camera`` is what the frames show
-    of the camera, if they do; ``left_out`` counts the images of a folder that are no frames,
-    ``unproven`` the frames whose equal parts prove no repetition; ``labels`` are those that the
-    thresholds have adapted to, ``adapted`` is what they came to; ``in_alarm`` counts frames during
-    an alarm, and ``drift`` is the last frame's.
+    ``truth`` gives the true poses; ``width_sum`` sums the widths of bounded frames, without gaps;
+    ``disjoint`` counts frames with a gap in some degree of freedom; ``skipped`` counts frames
+    dropped for a newer one; ``matched`` counts frames that have a true pose, ``compared`` those of
+    status ok among them, and ``covered`` those whose set holds the true value, per degree of
+    freedom; ``camera`` is what the frames show of the camera, if they do; ``left_out`` counts the
+    images of a folder that are no frames, ``unproven`` the frames whose equal parts prove no
+    repetition; ``labels`` are those that the thresholds have adapted to, ``adapted`` is what they
+    came to; ``in_alarm`` counts frames during an alarm, and ``drift`` is the last frame's.
     """
 
     dof: tuple[str, ...]
     confidence: float
     scope: str
-    with_truth: bool = False
+    truth: GroundTruth | None = None
     statuses: Counter[str] = field(default_factory=Counter)
     reasons: Counter[str] = field(default_factory=Counter)
     latency: LatencyProfile = field(default_factory=LatencyProfile)
@@ -66,9 +66,11 @@ class RunSummary:
     unproven: int = 0
     # Frames are numbered from 0, so that dropped frames at the start are counted, too.
     _last_seq: int = -1
+    _first_key: Key | None = None
+    _last_key: Key | None = None
 
-    def add(self, estimate: PoseInterval, truth: Array | None) -> None:
-        """Count one estimate; ``truth`` is its true pose (7,) or None."""
+    def add(self, estimate: PoseInterval) -> None:
+        """Count one estimate."""
         self.skipped += estimate.seq - self._last_seq - 1
         self._last_seq = estimate.seq
         self.statuses[estimate.status] += 1
@@ -80,12 +82,25 @@ class RunSummary:
             self.bounded += 1
             self.width_sum += estimate.conformal_set.width()
             self.disjoint += any(len(row) > 1 for row in estimate.bands or ())
+        if self.truth is not None:
+            self._compare(estimate, self.truth)
+
+    def _compare(self, estimate: PoseInterval, truth: GroundTruth) -> None:
+        key = truth.key_of(estimate)
+        self._first_key = key if self._first_key is None else self._first_key
+        self._last_key = key if key is not None else self._last_key
+        pose = truth.pose_of(estimate)
+        self.matched += pose is not None
         # A frame that a check flags has no interval that could hold anything.
-        self.matched += truth is not None
-        if truth is not None and estimate.status is Status.OK:
+        if pose is not None and estimate.status is Status.OK:
             self.compared += 1
-            self.covered += estimate.covers(truth)
-            self.covered_jointly += estimate.contains(truth)
+            self.covered += estimate.covers(pose)
+            self.covered_jointly += estimate.contains(pose)
+
+    def match_text(self, truth: GroundTruth) -> str:
+        """Return how many frames have a true pose, and what frames and poses were matched by."""
+        spans = truth.spans(self._first_key, self._last_key)
+        return f"{self.matched} of {self.frames} frames matched by {truth.by} ({spans})"
 
     def _drift_text(self, drift: Drift) -> str:
         if drift.state == "unknown":
@@ -133,6 +148,8 @@ class RunSummary:
             lines.append(self.labels.line())
         if self.adapted is not None:
             lines.append(_adapted_line(self.adapted))
+        if self.truth is not None:
+            lines += _truth_lines(self, self.truth)
         latency = self.latency.summary()
         if latency:
             total, model = latency["total"], latency["model"]
@@ -147,11 +164,10 @@ class RunSummary:
             shown = [*map(_length, width[:3].tolist()), *map(_turn, width[3:].tolist())]
             cells = "".join(f"{cell:>9}" for cell in shown)
             lines.append("mean width".ljust(len(lines[-1]) - 54) + cells)
-        if self.with_truth and not self.compared:
-            nothing = "no frame matched the ground truth, by name or by stamp"
-            if self.matched:
-                nothing = f"none of the {self.matched} frames with a true pose has status ok"
-            lines.append(f"coverage    {nothing}")
+        if self.matched and not self.compared:
+            lines.append(
+                f"coverage    none of the {self.matched} frames with a true pose has status ok"
+            )
         if self.compared:
             share = self.covered / self.compared
             lines.append(
@@ -178,6 +194,15 @@ def _short(value: float, unit: str) -> str:
     return f"{value:.1f} {unit}" if value < 99.95 else f"{value:.0f} {unit}"
 
 
+def _truth_lines(summary: RunSummary, truth: GroundTruth) -> list[str]:
+    lines = []
+    if truth.skipped:
+        lines.append(f"true poses  {truth.skipped}")
+    if 2 * summary.matched < summary.frames:
+        lines.append(f"true poses  {summary.match_text(truth)}")
+    return lines
+
+
 def _adapted_line(adapted: Adapted) -> str:
     if not adapted.labels:
         return "thresholds  as calibrated: no label yet" + ", frozen" * adapted.frozen
@@ -192,7 +217,6 @@ def run(
     write: Callable[[PoseInterval], None],
     *,
     summary: RunSummary,
-    truth: GroundTruth | None = None,
     labels: Labels | None = None,
     max_frames: int | None = None,
     expect_motion: bool = False,
@@ -211,7 +235,7 @@ def run(
         with closing(odometer.stream(frames, moving=expect_motion or None)) as estimates:
             for estimate in islice(estimates, max_frames):
                 write(estimate)
-                summary.add(estimate, truth.pose_of(estimate) if truth else None)
+                summary.add(estimate)
                 if labels is not None:
                     labels.after(estimate)
                 if tick is not None:

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SourceError
+from cvo_edge.trajectories.poses import quaternion_pose
+from cvo_edge.trajectories.tables import read_rows
 from cvo_export.calibrate import calibrate
 from cvo_export.datasets import base, open_dataset
 from cvo_export.datasets.base import Intrinsics, PoseDataset, remembered
 from cvo_export.datasets.describe import describe, summary
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.poses import quaternion_pose
 from cvo_export.datasets.sizes import image_sizes, one_size
-from cvo_export.datasets.tables import read_rows
 from cvo_export.training.run import open_run
 
 from .conftest import tiny_config
@@ -168,7 +168,7 @@ def test_an_empty_file_has_no_rows(tmp_path):
 
 
 def test_a_folder_is_no_file(tmp_path):
-    with pytest.raises(SourceError, match=r"expected a file of x y, but it cannot be read"):
+    with pytest.raises(SourceError, match=r"expected a regular file, found a folder"):
         read_rows(tmp_path, "x y")
 
 

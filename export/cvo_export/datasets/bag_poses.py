@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
+from cvo_edge.trajectories.poses import quaternion_pose
 from cvo_export.datasets.bag import Bag, stamp_ns
-from cvo_export.datasets.poses import quaternion_pose
 from cvo_export.datasets.track import Mask, Stamps, Track
 
 Array = NDArray[np.float64]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.camera import Camera, Distortion
 from cvo_edge.pose import about
+from cvo_edge.trajectories.trajectory import Skipped
 
 # A place whose middle is further than this from zero gets an origin of its own, of round numbers.
 _FAR_M, _ROUND_M = 1000.0, 100
@@ -165,7 +166,4 @@ def remembered(dataset: PoseDataset) -> PoseDataset:
 
 def skipped_text(skipped: Mapping[str, int]) -> str:
     """Return a text with the number of skipped frames by reason: ``skipped 3: invalid pose 3``."""
-    if not skipped:
-        return "none skipped"
-    reasons = ", ".join(f"{reason} {count}" for reason, count in skipped.items())
-    return f"skipped {sum(skipped.values())}: {reasons}"
+    return str(skipped if isinstance(skipped, Skipped) else Skipped(skipped))

@@ -21,11 +21,11 @@ from cvo_edge.camera import Camera, Distortion
 from cvo_edge.errors import SourceError
 from cvo_edge.input.image_files import natural_key
 from cvo_edge.pose import Pose
+from cvo_edge.trajectories.poses import quaternion_pose
+from cvo_edge.trajectories.tables import read_text
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.poses import quaternion_pose
-from cvo_export.datasets.tables import read_text
 
 Array = NDArray[np.float64]
 

@@ -1,11 +1,8 @@
 """EuRoC MAV (Burri et al. 2016) in the ASL layout: images and ground truth under ``mav0``.
 
 ``cam0/data.csv`` lists ``timestamp,filename`` of the images in ``cam0/data``.
-``state_groundtruth_estimate0/data.csv`` lists ``timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z,...``:
-integer nanoseconds, metres and a quaternion, scalar first. This is the pose of the body (the IMU)
-in the world. ``T_BS`` in ``cam0/sensor.yaml`` is ``T_body_camera``, so
-
-    T_world_camera = T_world_body @ T_BS
+``state_groundtruth_estimate0/data.csv`` is read as ``cvo_edge.trajectories.euroc`` describes, with
+``T_BS`` of ``cam0/sensor.yaml``.
 
 Images are grey and returned as BGR. Lens distortion is read, not corrected.
 """
@@ -18,23 +15,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.trajectories.euroc import MAX_STAMP_DIFFERENCE_NS, read_euroc
+from cvo_edge.trajectories.tables import read_rows
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.poses import camera_pose, quaternion_pose
 from cvo_export.datasets.sensors import pinhole, read_document, rigid_transform
 from cvo_export.datasets.stamps import add_associated
-from cvo_export.datasets.tables import read_rows
 
 Array = NDArray[np.float64]
 
 _IMAGES = "mav0/cam0/data.csv"
 _CAMERA = "mav0/cam0/sensor.yaml"
 _POSES = "mav0/state_groundtruth_estimate0/data.csv"
-
-# One period of the ground truth (200 Hz). Camera and IMU are triggered together and the ground
-# truth uses the IMU's stamps, so the nearest pose belongs to the image and needs no interpolation.
-_MAX_STAMP_DIFFERENCE_NS = 5_000_000
 
 
 def open_euroc(path: str) -> PoseDataset:
@@ -66,16 +59,8 @@ def _add_recording(frames: FrameList, name: str, folder: Path, T_body_camera: Ar
     listed = read_rows(folder / _IMAGES, "timestamp,filename", separator=",")
     image_folder = (folder / _IMAGES).with_name("data")
     images = [(row.nanoseconds(), image_folder / row.fields[1]) for row in listed]
-    form = "timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z"
-    rows = read_rows(folder / _POSES, form, separator=",", more=True)
-    values = [row.numbers(1) for row in rows]
-
-    def pose_of(place: int) -> Array | None:
-        body = quaternion_pose(values[place][:3], np.roll(values[place][3:], -1))
-        return camera_pose(body, T_body_camera)
-
-    stamps_ns = [row.nanoseconds() for row in rows]
-    add_associated(frames, name, images, stamps_ns, pose_of, _MAX_STAMP_DIFFERENCE_NS)
+    trajectory = read_euroc(folder / _POSES, T_body_camera)
+    add_associated(frames, name, images, trajectory, MAX_STAMP_DIFFERENCE_NS)
 
 
 def _read_camera(path: Path) -> tuple[tuple[Intrinsics, Lens] | None, Array]:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from cvo_edge.errors import SourceError
 from cvo_edge.input.decoding import decode_image, image_size
 from cvo_edge.input.image_files import frame_name, images_in
-from cvo_export.datasets.base import PoseDataset, skipped_text
+from cvo_edge.trajectories.trajectory import LISTED_TWICE, Skipped
+from cvo_export.datasets.base import PoseDataset
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ class FrameList:
         # Dictionaries keep insertion order, which numbers the sequences.
         self._sequence_names: dict[str, int] = {}
         self._frame_names: dict[str, None] = {}
-        self._skipped: Counter[str] = Counter()
+        self._skipped = Skipped()
         self._left_out: Counter[str] = Counter()
 
     def colour_images(self, folder: Path) -> list[Path]:
@@ -49,19 +50,21 @@ class FrameList:
         image: Path,
         pose: Array | None,
         stamp_ns: int | None = None,
+        where: str = "",
     ) -> None:
         """Add a frame with its ``T_world_camera`` (7,), or count it as skipped.
 
-        A pose of None is invalid; a stamp of None is unknown. A sequence appears only if at least
+        A pose of None is invalid, for the reason and at the place that ``where`` states; a stamp of
+        None is unknown. A sequence appears only if at least
         one of its frames is kept.
         """
         frame = f"{sequence}/{name}"
         if pose is None:
-            self.skip("invalid pose")
+            self.skip("invalid pose", where)
         elif not image.is_file():
             self.skip("image missing")
         elif frame in self._frame_names:
-            self.skip("listed twice")
+            self.skip(LISTED_TWICE)
         else:
             number = self._sequence_names.setdefault(sequence, len(self._sequence_names))
             self._frame_names[frame] = None
@@ -88,14 +91,14 @@ class FrameList:
                 stamp_ns = stamps_ns[number] if number < len(stamps_ns) else None
                 self.add(sequence, frame_name(image.name), image, poses[number], stamp_ns)
 
-    def skip(self, reason: str) -> None:
-        """Count a skipped frame."""
-        self._skipped[reason] += 1
+    def skip(self, reason: str, where: str = "", count: int = 1) -> None:
+        """Count skipped frames; ``where`` is the place of the reason, if it has one."""
+        self._skipped.add(reason, where, count)
 
     def dataset(self, name: str) -> PoseDataset:
         """Return the data set of the kept frames; raises SourceError if there are none."""
         if not self._images:
-            skipped = f"; {skipped_text(self._skipped)}" if self._skipped else ""
+            skipped = f"; {self._skipped}" if self._skipped else ""
             raise SourceError(f"{self._root}: expected frames with a pose, found none{skipped}")
         return PoseDataset(
             name=name,
@@ -105,7 +108,7 @@ class FrameList:
             frame_names=tuple(self._frame_names),
             read_image=image_reader(self._images),
             image_size=partial(_size_of, tuple(self._images)),
-            skipped=dict(self._skipped),
+            skipped=self._skipped,
             left_out=dict(self._left_out),
             stamps_ns=None if None in self._stamps_ns else np.array(self._stamps_ns, np.int64),
         )

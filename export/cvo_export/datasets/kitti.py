@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.ground_truth import matrix_to_pose
 from cvo_edge.input.image_files import natural_key
+from cvo_edge.trajectories.poses import camera_pose, matrix_to_pose
+from cvo_edge.trajectories.tables import Row, read_rows
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.folders import only_world
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.poses import camera_pose
-from cvo_export.datasets.tables import Row, read_rows
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from cvo_edge.errors import SourceError
+from cvo_edge.trajectories.tables import read_text
 from cvo_export.datasets.base import Intrinsics, PoseDataset
-from cvo_export.datasets.tables import read_text
 
 
 def read_numbers(path: Path, counts: Sequence[int], what: str) -> list[float]:

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from cvo_edge.input.image_files import natural_key
+from cvo_edge.trajectories.poses import quaternion_pose
+from cvo_edge.trajectories.tables import read_rows
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.folders import only_world
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.poses import quaternion_pose
-from cvo_export.datasets.tables import read_rows
 
 _COLOUR = "-color.png"
 

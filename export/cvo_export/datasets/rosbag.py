@@ -27,8 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.ground_truth import MAX_STAMP_DIFFERENCE_NS, matrix_to_pose, read_pose_matrix
 from cvo_edge.pose import Pose
+from cvo_edge.trajectories.poses import matrix_to_pose, read_pose_matrix
+from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS
 from cvo_export.datasets.bag import Bag, find_bags
 from cvo_export.datasets.bag_images import bag_camera, image_topic, message_image, message_size
 from cvo_export.datasets.bag_poses import (

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from cvo_edge.ground_truth import read_pose_matrix
 from cvo_edge.input.image_files import natural_key
+from cvo_edge.trajectories.poses import read_pose_matrix
 from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.folders import only_world
 from cvo_export.datasets.frames import FrameList

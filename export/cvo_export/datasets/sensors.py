@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from cvo_edge.camera import Distortion
 from cvo_edge.errors import SourceError
-from cvo_edge.ground_truth import matrix_to_pose
+from cvo_edge.trajectories.poses import matrix_to_pose
+from cvo_edge.trajectories.tables import read_text
 from cvo_export.datasets.base import Intrinsics, Lens
-from cvo_export.datasets.tables import read_text
 
 Array = NDArray[np.float64]
 

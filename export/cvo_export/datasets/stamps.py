@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cvo_edge.ground_truth import nearest_stamp
+from cvo_edge.trajectories.trajectory import LISTED_TWICE, Trajectory, nearest_stamp
 from cvo_export.datasets.frames import FrameList
-
-Array = NDArray[np.float64]
 
 
 def add_associated(
     frames: FrameList,
     sequence: str,
     images: Sequence[tuple[int, Path]],
-    stamps_ns: Sequence[int],
-    pose_of: Callable[[int], Array | None],
+    trajectory: Trajectory[int],
     bound_ns: int,
 ) -> None:
     """Add a sequence to ``frames``, in the order of its images' stamps.
@@ -32,19 +26,18 @@ def add_associated(
         Name of the sequence.
     images
         Stamp in nanoseconds and file of each image.
-    stamps_ns
-        Stamps of the poses, in any order.
-    pose_of
-        Maps an index in ``stamps_ns`` to the pose (7,), or None if it is invalid.
+    trajectory
+        Poses by stamp.
     bound_ns
         Largest distance between the stamps of an image and its pose; images without a pose within
         it are left out and counted.
     """
-    order = sorted(range(len(stamps_ns)), key=stamps_ns.__getitem__)
-    ascending = [stamps_ns[place] for place in order]
+    if repeated := trajectory.skipped.get(LISTED_TWICE):
+        frames.skip(LISTED_TWICE, trajectory.skipped.first[LISTED_TWICE], repeated)
     for stamp_ns, image in sorted(images, key=lambda image: image[0]):
-        nearest = nearest_stamp(ascending, stamp_ns, bound_ns)
+        nearest = nearest_stamp(trajectory.keys, stamp_ns, bound_ns)
         if nearest is None:
             frames.skip(f"no pose within {bound_ns / 1e9:g} s")
         else:
-            frames.add(sequence, image.stem, image, pose_of(order[nearest]), stamp_ns)
+            where = trajectory.faults.get(nearest, "")
+            frames.add(sequence, image.stem, image, trajectory.poses[nearest], stamp_ns, where)

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
-from cvo_edge.ground_truth import matrix_to_pose
+from cvo_edge.trajectories.poses import matrix_to_pose
+from cvo_edge.trajectories.tables import read_text
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.colmap import camera_of
 from cvo_export.datasets.folders import only_camera
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.tables import read_text
 
 _FILE = "transforms.json"
 _AXES = np.diag([1.0, -1.0, -1.0, 1.0])

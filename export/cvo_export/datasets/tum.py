@@ -1,8 +1,7 @@
 """TUM RGB-D (Sturm et al. 2012): images in ``rgb.txt`` and poses in ``groundtruth.txt``, by stamp.
 
-A line of ``groundtruth.txt`` is ``timestamp tx ty tz qx qy qz qw``: seconds, metres and a
-quaternion, scalar last. The pose is ``T_world_camera`` of the colour camera (OpenCV), in the frame
-of the motion capture system. Lines that begin with ``#`` are comments. Depth images are not read.
+``groundtruth.txt`` is read as ``cvo_edge.trajectories.tum`` describes. The pose is that of the
+colour camera (OpenCV), in the frame of the motion capture system. Depth images are not read.
 """
 
 from __future__ import annotations
@@ -12,13 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from cvo_edge.camera import Distortion
-from cvo_edge.ground_truth import MAX_STAMP_DIFFERENCE_NS
+from cvo_edge.trajectories.tables import read_rows
+from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS, read_tum
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.poses import quaternion_pose
 from cvo_export.datasets.stamps import add_associated
-from cvo_export.datasets.tables import read_rows
 
 # Intrinsics and distortion of the colour cameras at 640x480, as calibrated by the data set's
 # authors ("File formats", table of intrinsics of the RGB cameras). The images of freiburg3 are
@@ -67,16 +65,8 @@ def open_tum(path: str) -> PoseDataset:
 def _add_sequence(frames: FrameList, name: str, folder: Path) -> None:
     listed = read_rows(folder / "rgb.txt", "timestamp filename")
     images = [(row.seconds(), folder / row.fields[1]) for row in listed]
-    rows = read_rows(folder / "groundtruth.txt", "timestamp tx ty tz qx qy qz qw")
-    values = [row.numbers(1) for row in rows]
-    add_associated(
-        frames,
-        name,
-        images,
-        [row.seconds() for row in rows],
-        lambda place: quaternion_pose(values[place][:3], values[place][3:]),
-        MAX_STAMP_DIFFERENCE_NS,
-    )
+    trajectory = read_tum(folder / "groundtruth.txt")
+    add_associated(frames, name, images, trajectory, MAX_STAMP_DIFFERENCE_NS)
 
 
 def _camera(name: str) -> tuple[Intrinsics, Lens] | None:

@@ -21,13 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.ground_truth import matrix_to_pose
+from cvo_edge.trajectories.poses import matrix_to_pose, quaternion_pose
+from cvo_edge.trajectories.tables import read_rows
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.poses import quaternion_pose
 from cvo_export.datasets.sensors import pinhole, read_document, rigid_transform
-from cvo_export.datasets.tables import read_rows
 from cvo_export.datasets.track import Track
 
 _IMAGES = "mav0/cam0/data.csv"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,11 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.ground_truth import seconds_to_ns
+from cvo_edge.files import read_regular_file
 
 Array = NDArray[np.float64]
 
 _SHOWN = 80
+_MAX_BYTES = 256 << 20
+
+# The year 5138. Larger numbers are stamps in a smaller unit.
+_LAST_S = 10**11
 
 
 class Row(NamedTuple):
@@ -32,11 +37,21 @@ class Row(NamedTuple):
             raise self.refusal() from None
 
     def seconds(self) -> int:
-        """Return the first column, a time in seconds, as integer nanoseconds."""
+        """Return the first column, a time in seconds, as integer nanoseconds.
+
+        Raises SourceError for other text, and for times that cannot be in seconds.
+        """
         try:
-            return seconds_to_ns(self.fields[0])
+            stamp_ns = seconds_to_ns(self.fields[0])
         except ValueError:
             raise self.refusal() from None
+        if abs(stamp_ns) > _LAST_S * 10**9:
+            found = f"found {self.fields[0][:_SHOWN]} in line {self.number}"
+            raise SourceError(
+                f"{self.path}: expected stamps in seconds, {found}; convert nanoseconds (or "
+                "milliseconds) to seconds"
+            )
+        return stamp_ns
 
     def nanoseconds(self) -> int:
         """Return the first column, a time in integer nanoseconds."""
@@ -45,12 +60,17 @@ class Row(NamedTuple):
             raise self.refusal()
         return int(self.fields[0])
 
+    @property
+    def where(self) -> str:
+        """The file's name and the number of the line."""
+        return f"{self.path.name}, line {self.number}"
+
     def refusal(self) -> SourceError:
         """Return an error that states what was expected in this line."""
-        found = " ".join(self.fields)[:_SHOWN]
-        return SourceError(
-            f"{self.path}: expected {self.form}, found {found!r} in line {self.number}"
-        )
+        found = f"found {' '.join(self.fields)[:_SHOWN]!r} in line {self.number}"
+        named = len(self.fields) > 1 and all(field.isidentifier() for field in self.fields)
+        hint = "; put # before a line of names" if named else ""
+        return SourceError(f"{self.path}: expected {self.form}, {found}{hint}")
 
 
 def read_rows(
@@ -97,12 +117,23 @@ def read_rows(
 
 def read_text(path: Path, form: str) -> str:
     """Read a UTF-8 file; raises SourceError, stating that ``form`` was expected."""
+    if not os.path.exists(path):  # noqa: PTH110 - also of a name too long
+        raise SourceError(f"{path}: expected a file of {form}, found none")
     try:
-        return path.read_text("utf-8-sig")
-    except FileNotFoundError:
-        problem = "found none"
-    except OSError as error:
-        problem = f"but it cannot be read: {error.strerror}"
+        return read_regular_file(path, _MAX_BYTES, SourceError, links=True).decode("utf-8-sig")
     except UnicodeDecodeError:
-        problem = "found text that is not UTF-8"
-    raise SourceError(f"{path}: expected a file of {form}, {problem}")
+        raise SourceError(
+            f"{path}: expected a file of {form}, found text that is not UTF-8"
+        ) from None
+
+
+def seconds_to_ns(text: str) -> int:
+    """Decimal seconds as text -> integer nanoseconds; raises ValueError if it is not a number."""
+    seconds, _, fraction = text.partition(".")
+    if seconds.isdecimal() and (fraction.isdecimal() or not fraction):
+        # A double resolves present-day stamps only to 200 ns, so the digits are parsed.
+        return int(seconds) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
+    try:
+        return round(float(text) * 1e9)
+    except OverflowError:
+        raise ValueError(text) from None

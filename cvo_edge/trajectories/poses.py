@@ -1,0 +1,107 @@
+"""Convert numbers from files to poses, or to None if they are invalid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge import geometry
+from cvo_edge.errors import SourceError
+from cvo_edge.files import read_regular_file
+from cvo_edge.pose import Pose
+from cvo_edge.trajectories.trajectory import Entry, Trajectory, trajectory_of
+
+Array = NDArray[np.float64]
+
+MATRIX_SUFFIX = ".pose.txt"
+_MAX_MATRIX_BYTES = 1 << 16
+
+# Files round quaternions and matrices to a few digits.
+_TOLERANCE = 0.01
+
+
+def quaternion_pose(position_m: Array, q_xyzw: Array) -> Array | None:
+    """Return the pose (7,) of a position (3,), metres, and a quaternion (4,); unit, qw >= 0.
+
+    Norms within 0.01 of 1 are normalised. Returns None for other norms and for numbers that are not
+    finite; ``quaternion_fault`` says which it is.
+    """
+    if quaternion_fault(position_m, q_xyzw) is not None:
+        return None
+    return np.concatenate([position_m, geometry.quaternion_normalise(q_xyzw)])
+
+
+def quaternion_fault(position_m: Array, q_xyzw: Array) -> str | None:
+    """Return why a position and a quaternion are no pose, or None."""
+    if not (np.isfinite(position_m).all() and np.isfinite(q_xyzw).all()):
+        return "a number that is not finite"
+    with np.errstate(over="ignore"):
+        norm = float(np.linalg.norm(q_xyzw))
+    return None if abs(norm - 1.0) <= _TOLERANCE else f"a quaternion of norm {norm:.3g}"
+
+
+def camera_pose(pose: Array | None, T_body_camera: Array) -> Array | None:
+    """Return ``T_world_camera`` (7,) from ``T_world_body`` (7,) and ``T_body_camera`` (4, 4)."""
+    if pose is None:
+        return None
+    return Pose.from_matrix(Pose.from_array(pose).to_matrix() @ T_body_camera).to_array()
+
+
+def matrix_to_pose(T: Array) -> Array | None:
+    """Homogeneous matrix (4, 4) in metres -> pose (7,), or None if it is invalid.
+
+    The rotation is made orthonormal (recorded ones deviate by up to 4e-4). A matrix is invalid if
+    it is not finite or its rotation part is more than 0.01 away from a rotation; ``matrix_fault``
+    says which it is.
+    """
+    if matrix_fault(T) is not None:
+        return None
+    R = geometry.nearest_rotation(T[:3, :3])
+    return np.concatenate([T[:3, 3], geometry.matrix_to_quaternion(R)])
+
+
+def matrix_fault(T: Array) -> str | None:
+    """Return why a matrix (4, 4) is no pose, or None."""
+    if not np.isfinite(T).all():
+        return "a number that is not finite"
+    off = float(np.abs(geometry.nearest_rotation(T[:3, :3]) - T[:3, :3]).max())
+    if off > _TOLERANCE:
+        return f"a matrix {off:.3g} away from a rotation"
+    return None if np.abs(T[3] - [0, 0, 0, 1]).max() <= 1e-6 else "a last row other than 0 0 0 1"
+
+
+def read_pose_matrix(path: Path) -> Array | None:
+    """Read a 4x4 camera-to-world matrix in metres -> pose (7,), or None if it is invalid.
+
+    Recordings mark lost tracking by files without 16 numbers or with an invalid matrix.
+    """
+    T = _matrix(path)
+    return matrix_to_pose(T) if T.size == 16 else None
+
+
+def pose_matrix_fault(path: Path) -> str | None:
+    """Return why a file holds no pose, or None."""
+    T = _matrix(path)
+    return matrix_fault(T) if T.size == 16 else f"{T.size or 'no'} numbers instead of 16"
+
+
+def read_pose_matrices(folder: Path) -> Trajectory[str]:
+    """Read the ``.pose.txt`` of a folder, by frame name; raises SourceError if none is valid."""
+    entries = []
+    for file in sorted(folder.glob("*" + MATRIX_SUFFIX)):
+        pose = read_pose_matrix(file)
+        fault = pose_matrix_fault(file) if pose is None else None
+        entries.append(Entry(file.name.removesuffix(MATRIX_SUFFIX), pose, file.name, fault))
+    return trajectory_of(folder, entries)
+
+
+def _matrix(path: Path) -> Array:
+    """Return the 16 numbers of a file as (4, 4), or others, or none."""
+    try:
+        content = read_regular_file(path, _MAX_MATRIX_BYTES, SourceError, links=True)
+        T = np.array(content.decode("ascii").split(), dtype=np.float64)
+    except (SourceError, ValueError):
+        return np.empty(0)
+    return T.reshape(4, 4) if T.size == 16 else T
