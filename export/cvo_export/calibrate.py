@@ -8,7 +8,7 @@ keeps its method and gets thresholds from new data: a new site, another camera, 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,15 +51,18 @@ from cvo_export.bundles.draft import (
     versions,
     with_any_rotation,
 )
+from cvo_export.bundles.observed import Observed
 from cvo_export.bundles.rule import chosen_rule
 from cvo_export.bundles.thresholds import calibrated
 from cvo_export.bundles.writing import check_target, write_bundle
+from cvo_export.data.errors import mean_pose_error, median_error
 from cvo_export.data.splits import Split, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
 from cvo_export.datasets.sizes import Size, one_size
-from cvo_export.graph.adapt import adapted, refuse_other_form
-from cvo_export.graph.adapt_options import read_input, read_outputs, read_size
+from cvo_export.graph.adapt import adapted, other_form, refuse_other_form
+from cvo_export.graph.adapt_options import OutputForm, read_input, read_outputs, read_size
 from cvo_export.graph.external import read_onnx
+from cvo_export.graph.trial import Form, tried
 from cvo_export.vocabulary import GivenRotation
 
 Array = NDArray[np.float64]
@@ -138,9 +141,19 @@ def calibrate(
         model_bytes = bundle.model_bytes
         candidates = bundle.head.candidates()
     else:
-        model_bytes, left_out = _read_model(model, given_input, given_outputs, size_text)
-        if left_out:
-            print(f"outputs left out: {', '.join(left_out)}", file=sys.stderr)
+        network = read_onnx(model)
+        form = Form(
+            read_input(given_input),
+            read_outputs(given_outputs) or {"pose": OutputForm("pose")},
+            read_size(size_text),
+            crop or "none",
+        )
+        model_bytes = network.SerializeToString()
+        if given_input is not None or given_outputs or size_text is not None:
+            outputs = form.outputs if given_outputs else {}
+            model_bytes, left_out = adapted(network, form.given, outputs, form.size)
+            if left_out:
+                _say([f"outputs left out: {', '.join(left_out)}"])
         split = _new_split(dataset, kind, seed)
         if not all(abs(value) < MAX_NUMBER for value in origin_m or ()):
             raise UsageError(f"origin: expected metres below {MAX_NUMBER:g}, found {origin_m}")
@@ -151,6 +164,8 @@ def calibrate(
             origin_m,
         )
         candidates = _given_candidates(draft)
+        val = split.roles["val"]
+        _say(tried(network, form, dataset, val, origin_m, stated=bool(given_outputs)))
     rule, cap = chosen_rule(rule, cap, split.kind)
     own = provider or draft.model.provider
     # A solver's network recognises the place as the camera of its training shows it.
@@ -170,8 +185,26 @@ def calibrate(
         provenance=msgspec.structs.replace(draft.provenance, created_with=made),
     )
     chosen_from = selected(candidates, score, sides)
-    calibration = calibrated(draft, model_bytes, dataset, split.roles, chosen_from)
+    calibration = calibrated(draft, model_bytes, dataset, split.roles, chosen_from, _tell_errors)
     return write_bundle(bundle_dir, calibration, model_bytes)
+
+
+def _say(lines: Iterable[str]) -> None:
+    for line in lines:
+        print(line, file=sys.stderr, flush=True)
+
+
+def _tell_errors(*observed: Observed) -> None:
+    """Say which frames were refused, and compare the point error with the mean pose's."""
+    roles = zip(("val", "cal"), observed, strict=True)
+    _say(f"refused in {role}: {seen.refused}" for role, seen in roles if seen.refused)
+    poses, true_poses = (
+        np.concatenate([getattr(seen, name) for seen in observed]) for name in ("pose", "true_pose")
+    )
+    error, mean = median_error(poses, true_poses), mean_pose_error(true_poses)
+    _say([f"point error: median {error} of {len(poses)} frames; their mean pose's {mean}"])
+    if max(error.shares(mean)) >= 1.0:
+        _say(["warning: the network is no better than the mean pose, and its intervals are wide"])
 
 
 def _of_size(camera: Camera | None, size: Size) -> Camera | None:
@@ -219,16 +252,6 @@ def _new_split(dataset: PoseDataset, kind: SplitKind | None, seed: int | None) -
     return make_split(dataset, kind, seed or 0, "calibration")
 
 
-def _read_model(
-    path: Path, given: str | None, outputs: Sequence[str], size: str | None
-) -> tuple[bytes, tuple[str, ...]]:
-    """Return a model file in a bundle's form, and which of its outputs were left out."""
-    model = read_onnx(path)
-    if given is None and size is None and not outputs:
-        return model.SerializeToString(), ()
-    return adapted(model, read_input(given), read_outputs(outputs), read_size(size))
-
-
 def _opset(model: onnx.ModelProto) -> int:
     versions = [entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")]
     return int(max(versions, default=1))
@@ -258,13 +281,7 @@ def _from_model(
         or statistics not in ({}, FAMILIARITY)
         or [_fields(tensor) for tensor in spec.inputs] != [image]
     ):
-        raise BundleMismatchError(
-            "model: expected the input image uint8 [1, height, width, 3] and the outputs pose "
-            "[1, 7], or pose [1, 7], lower [1, 6] and upper [1, 6], found "
-            + ", ".join(
-                f"{t.name} {t.dtype} {list(t.shape)}" for t in (*spec.inputs, *spec.outputs)
-            )
-        )
+        raise other_form(model)
     if min(shape[1:3]) < _LEAST_INPUT:
         raise BundleMismatchError(
             f"model: expected an input of at least {_LEAST_INPUT}x{_LEAST_INPUT} pixels, found "

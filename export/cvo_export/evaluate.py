@@ -114,8 +114,8 @@ def evaluate(
             "frames": {
                 "total": len(indices),
                 "bounded": _bounded(levels, len(seen.indices)),
-                "degraded": seen.degraded,
-                "invalid": seen.invalid,
+                "degraded": seen.refused.degraded,
+                "invalid": seen.refused.invalid,
             },
             "n_calibration": calibration.calibration.n,
             # If true, the subset "all" may include frames that the network was trained on.

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import betabinom, spearmanr
 
-from cvo_edge import geometry
 from cvo_edge.bundle.format import Calibration, Threshold
 from cvo_edge.conformal import conformal_rank, interval_score
 from cvo_edge.guarantee import statement
@@ -21,6 +20,7 @@ from cvo_export.bundles.choice import moving, workspace
 from cvo_export.bundles.observed import Observed
 from cvo_export.bundles.thresholds import effective_frames
 from cvo_export.bundles.volume import ellipsoids_log_volume
+from cvo_export.data.errors import pose_errors
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
@@ -36,11 +36,7 @@ _LARGEST_LOG = 700.0
 
 def point_error(seen: Observed) -> dict[str, float]:
     """Return the median and two quantiles of the position (m) and rotation (deg) errors."""
-    distance = np.linalg.norm(seen.pose[:, :3] - seen.true_pose[:, :3], axis=1)
-    difference = geometry.quaternion_multiply(
-        geometry.quaternion_conjugate(seen.pose[:, 3:]), seen.true_pose[:, 3:]
-    )
-    angle = np.rad2deg(np.linalg.norm(geometry.quaternion_log(difference), axis=1))
+    distance, angle = pose_errors(seen.pose, seen.true_pose)
     return {
         "median_m": float(np.median(distance)),
         "median_deg": float(np.median(angle)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,6 +19,7 @@ from cvo_edge.odometer import Odometer
 from cvo_edge.pose import about
 from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import SCOPES
+from cvo_export.bundles.refused import Refused
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]
@@ -51,8 +51,8 @@ class Observed:
     ``outputs`` (n, ...) are the network's outputs by name; ``point`` and ``truth`` (n, 6) are in
     the bundle's chart; ``pose`` and ``true_pose`` are (n, 7); all positions are relative to the
     bundle's origin. ``sequence`` (n,) holds sequence numbers; ``coloured`` (n,) tells which images
-    have colour; ``size`` is width and height of the first image; ``invalid`` and ``degraded``
-    count the frames that the checks excluded. ``judged`` is None if the graph has no statistics.
+    have colour; ``size`` is width and height of the first image; ``refused`` counts the frames that
+    the checks excluded. ``judged`` is None if the graph has no statistics.
     """
 
     indices: NDArray[np.int64]
@@ -64,8 +64,7 @@ class Observed:
     sequence: NDArray[np.int64]
     coloured: NDArray[np.bool_]
     size: tuple[int, int]
-    invalid: int
-    degraded: int
+    refused: Refused
     judged: Judged | None
 
     def in_colour(self) -> Observed:
@@ -114,30 +113,27 @@ def observe(
     kept: list[int] = []
     seen: list[Observation] = []
     judged: list[tuple[NDArray[np.float32], int, bool]] = []
-    reasons: Counter[str] = Counter()
-    invalid = degraded = 0
+    refused = Refused()
     for index in indices.tolist():
+        image, unread = None, ""
         try:
             image = dataset.read_image(index)
-        except SourceError:
-            image = None  # flagged as invalid, as on the device
+        except SourceError as error:
+            unread = str(error)  # flagged as invalid, as on the device
         observation = observer.observe(image, seq=index)
-        problem = observation.fault or observation.doubt
         if tells_of_the_place(observation) and observation.look is not None:
             number = int(dataset.sequence[index])
             judged.append((_statistics(observation), number, has_colour(observation.look)))
-        if problem is None:
+        if observation.fault is None and observation.doubt is None:
             kept.append(index)
             seen.append(observation)
-            continue
-        reasons[problem] += 1
-        invalid += observation.fault is not None
-        degraded += observation.fault is None
+        else:
+            true_pose = about(dataset.poses[index], observer.origin_m)
+            refused.add(observation, dataset.frame_names[index], true_pose, unread)
     if not seen:
-        found = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
         raise SourceError(
             f"{dataset.name}: expected frames that pass the frame checks, found none of "
-            f"{len(indices)}: {found}"
+            f"{len(indices)}: {refused}"
         )
     pose = np.array([observation.pose for observation in seen])
     looks = [observation.look for observation in seen if observation.look is not None]
@@ -155,8 +151,7 @@ def observe(
         sequence=dataset.sequence[kept],
         coloured=np.array([has_colour(look) for look in looks]),
         size=(looks[0].size[1], looks[0].size[0]),
-        invalid=invalid,
-        degraded=degraded,
+        refused=refused,
         judged=_judged(judged),
     )
 

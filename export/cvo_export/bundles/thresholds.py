@@ -7,7 +7,7 @@ Coverage then does not depend on the fidelity of the export: the graph that runs
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
 
@@ -49,12 +49,14 @@ def calibrated(
     dataset: PoseDataset,
     roles: Mapping[str, NDArray[np.int64]],
     candidates: Sequence[Candidate],
+    told: Callable[[Observed, Observed], None] | None = None,
 ) -> Calibration:
     """Calibrate a draft: run its model on val and cal, choose a score, compute thresholds.
 
     The val frames choose among the candidates (see ``chosen``), scale the degrees of freedom for
     the joint scope and, with noisy copies of them, decide on a difficulty (see
-    ``with_difficulty``); the cal frames give the thresholds.
+    ``with_difficulty``); the cal frames give the thresholds. ``told`` is called with what was
+    observed on val and cal.
 
     Raises
     ------
@@ -87,6 +89,8 @@ def calibrated(
         with draft.observer(model_bytes, head) as observer:
             val = observe(observer, dataset, roles["val"])
             cal = observe(observer, dataset, roles["cal"])
+    if told is not None:
+        told(val, cal)
     alarm = None
     if val.judged is not None:
         with draft.observer(model_bytes, head) as observer:

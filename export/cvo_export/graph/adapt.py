@@ -19,6 +19,7 @@ from cvo_edge.engine.session import one_line
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 from cvo_export.graph.adapt_options import InputForm, OutputForm
 from cvo_export.graph.nodes import Nodes
+from cvo_export.graph.tensors import advice, own_inputs, sizes, tensor_text, tensors_text
 
 Array = NDArray[np.float32]
 
@@ -53,12 +54,13 @@ def adapted(
         raise BundleMismatchError(
             f"model: expected opset {_LEAST_OPSET} or later, found {opset}; export it again"
         )
-    _check_roles(outputs)
+    _check_roles(outputs, model)
     own = [value.name for value in model.graph.output]
     for role, form in outputs.items():
         if form.name not in own:
             raise UsageError(
-                f"--output {role}: expected one of {', '.join(own)}, found {form.name}"
+                f"--output {role}: expected one of {', '.join(own)}, found {form.name}; "
+                f"{advice(model)}"
             )
     value = _own_input(model, given.name)
     model = compose.add_prefix(model, _OWN)
@@ -83,26 +85,69 @@ def adapted(
     return model.SerializeToString(), tuple(name for name in own if name not in used)
 
 
-def _check_roles(outputs: Mapping[str, OutputForm]) -> None:
+def image_before(
+    model: onnx.ModelProto, given: InputForm, size: tuple[int, int] | None
+) -> tuple[bytes, str, tuple[int, int]]:
+    """Return the network with a bundle's input and its own outputs; raises as ``adapted``.
+
+    The second value stands before the names of its outputs; the third is height and width.
+    """
+    value = _own_input(model, given.name)
+    model = compose.add_prefix(model, _OWN)
+    nodes = Nodes("adapter/")
+    shape = _put_image_before(model, nodes, value, given, size)
+    model.graph.initializer.extend(nodes.constants)
+    return model.SerializeToString(), _OWN, shape
+
+
+def pose_behind(
+    outputs: Mapping[str, OutputForm], shapes: Mapping[str, tuple[int, ...]]
+) -> tuple[bytes, dict[str, str]]:
+    """Return a graph from a network's own outputs, float32 of these shapes, to ``pose`` (1, 7).
+
+    The second value maps the names of the outputs to those of the graph's inputs.
+    """
+    nodes = Nodes("adapter/")
+    nodes.name(_pose_of(nodes, outputs, shapes)["pose"], "pose")
+    ports = {form.name: _OWN + form.name for form in outputs.values()}
+    graph = helper.make_graph(
+        nodes.after,
+        "pose",
+        [
+            helper.make_tensor_value_info(port, TensorProto.FLOAT, shapes[name])
+            for name, port in ports.items()
+        ],
+        [helper.make_tensor_value_info("pose", TensorProto.FLOAT, [1, 7])],
+        nodes.constants,
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    return model.SerializeToString(), ports
+
+
+def _check_roles(outputs: Mapping[str, OutputForm], model: onnx.ModelProto) -> None:
     found = set(outputs) - {"lower", "upper"}
     if found not in ({"pose"}, {"translation", "rotation"}) or len(outputs) - len(found) == 1:
         raise UsageError(
             "--output: expected pose, or translation and rotation, and lower and upper both or "
-            f"neither, found {', '.join(outputs) or 'none'}"
+            f"neither, found {', '.join(outputs) or 'none'}; {tensors_text(model)}; "
+            f"{advice(model)}"
         )
 
 
 def _own_input(model: onnx.ModelProto, name: str | None) -> onnx.ValueInfoProto:
-    constants = {tensor.name for tensor in model.graph.initializer}
-    values = [value for value in model.graph.input if value.name not in constants]
-    names = [value.name for value in values]
-    if len(values) != 1 or name not in (None, names[0]):
-        raise BundleMismatchError(
-            f"model: expected one input{f', {name}' if name else ''}, found "
-            f"{', '.join(names) or 'none'}"
+    values = own_inputs(model)
+    if name not in (None, *(value.name for value in values)):
+        raise UsageError(
+            f"--input: expected name= of the input, found {name}; {tensors_text(model)}"
         )
-    found: onnx.ValueInfoProto = values[0]
-    return found
+    dims = sizes(values[0]) if len(values) == 1 else []
+    kind = values[0].type.tensor_type.elem_type if dims else TensorProto.UNDEFINED
+    if len(dims) != 4 or dims[0] > 1 or kind not in _TYPES:
+        raise BundleMismatchError(
+            "model: expected one input, an image, uint8 or float, with a batch of 1 or a dynamic "
+            f"one, found {tensors_text(model)}; {advice(model)}"
+        )
+    return values[0]
 
 
 def _put_image_before(
@@ -114,14 +159,7 @@ def _put_image_before(
 ) -> tuple[int, int]:
     """Replace the input by ``image``; return its height and width."""
     kind = value.type.tensor_type.elem_type
-    dims = [dim.dim_value for dim in value.type.tensor_type.shape.dim]
-    form = f"{value.name} {TensorProto.DataType.Name(kind).lower()} {[d or '?' for d in dims]}"
-    form = form.replace("'", "")
-    if len(dims) != 4 or dims[0] not in (0, 1) or kind not in _TYPES:
-        raise BundleMismatchError(
-            "model: expected an input of one image, uint8 or float, of four dimensions, found "
-            f"{form}"
-        )
+    dims, form = sizes(value), tensor_text(value)
     layout = given.layout or ("nchw" if dims[1] == 3 else "nhwc" if dims[3] == 3 else None)
     if layout is None:
         raise UsageError(f"--input: expected layout=nchw or layout=nhwc for {form}, found neither")
@@ -129,6 +167,11 @@ def _put_image_before(
     if channels not in (0, 3):
         raise BundleMismatchError(
             f"model: expected 3 channels in the layout {layout}, found {form}"
+        )
+    if kind == TensorProto.UINT8 and (given.range, given.mean, given.std) != (None,) * 3:
+        raise UsageError(
+            f"--input: expected layout or order alone for {form}, which takes 0 to 255, found "
+            "range, mean or std"
         )
     if 0 in plane and size is None:
         raise UsageError(f"--size: expected HEIGHTxWIDTH, as the graph does not say it: {form}")
@@ -265,27 +308,19 @@ def _floats(values: float | Sequence[float]) -> Array:
 def refuse_other_form(model: onnx.ModelProto) -> None:
     """Raise BundleMismatchError, with the options that may fit, if the input is not an image.
 
-    Input ``image`` uint8 with fixed sizes passes; the names of the outputs are not looked at.
+    Input ``image`` uint8 with fixed sizes passes; the outputs are not looked at.
     """
-    constants = {tensor.name for tensor in model.graph.initializer}
-    inputs = [value for value in model.graph.input if value.name not in constants]
-    if len(inputs) != 1:
-        return
-    (value,) = inputs
-    dims = [dim.dim_value for dim in value.type.tensor_type.shape.dim]
-    kind = value.type.tensor_type.elem_type
-    fixed = (value.name, kind, dims[3:]) == ("image", TensorProto.UINT8, [3])
-    if (fixed and all(dims)) or len(dims) != 4 or kind not in _TYPES:
-        return
-    layout = "nchw" if dims[1] == 3 else "nhwc"
-    plane = dims[2:] if layout == "nchw" else dims[1:3]
-    form = f"{value.name} {TensorProto.DataType.Name(kind).lower()} {[d or '?' for d in dims]}"
-    form = form.replace("'", "")
-    size = "" if all(plane) else " --size HEIGHTxWIDTH"
-    scale = "" if kind == TensorProto.UINT8 else ",range=0-1"
-    outputs = ", ".join(value.name for value in model.graph.output)
-    raise BundleMismatchError(
-        "model: expected the input image uint8 [1, height, width, 3] and the output pose [1, 7], "
-        f"found input {form} and outputs {outputs}: state them, e.g. --input "
-        f"layout={layout}{scale}{size} --output pose={model.graph.output[0].name}"
+    form = [(v.name, v.type.tensor_type.elem_type, sizes(v)) for v in own_inputs(model)]
+    for name, kind, dims in form[:1]:
+        shaped = len(dims) == 4 and all(dims) and dims[0] == 1 and dims[3] == 3
+        if len(form) == 1 and (name, kind, shaped) == ("image", TensorProto.UINT8, True):
+            return
+    raise other_form(model)
+
+
+def other_form(model: onnx.ModelProto) -> BundleMismatchError:
+    """Return the error for a graph that no options describe, but that is not in a bundle's form."""
+    return BundleMismatchError(
+        "model: expected the input image uint8 [1, height, width, 3] and the outputs pose [1, 7], "
+        f"or pose, lower [1, 6] and upper [1, 6], found {tensors_text(model)}; {advice(model)}"
     )

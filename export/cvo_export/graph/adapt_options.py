@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 from cvo_edge.errors import UsageError
@@ -76,6 +76,16 @@ def read_outputs(texts: Sequence[str]) -> dict[str, OutputForm]:
     return outputs
 
 
+def input_text(form: InputForm) -> str:
+    """Return the text that ``read_input`` reads as this form."""
+    return ",".join(_stated(form, _INPUT))
+
+
+def output_text(role: str, form: OutputForm) -> str:
+    """Return the text that ``read_outputs`` reads as this form."""
+    return ",".join([f"{role}={form.name}", *_stated(form, _OF_ROLE[role])])
+
+
 def read_size(text: str | None) -> tuple[int, int] | None:
     """Read ``224x320``, height and width."""
     if text is None:
@@ -84,6 +94,16 @@ def read_size(text: str | None) -> tuple[int, int] | None:
     if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
         raise UsageError(f"--size: expected HEIGHTxWIDTH such as 224x320, found {text}")
     return int(height), int(width)
+
+
+def _stated(form: InputForm | OutputForm, keys: Sequence[str]) -> Iterator[str]:
+    """Yield ``key=value`` for what differs from its default."""
+    defaults = {each.name: each.default for each in fields(form)}
+    for key in keys:
+        value = getattr(form, key)
+        if value != defaults[key]:
+            text = "/".join(f"{n:g}" for n in value) if isinstance(value, tuple) else value
+            yield f"{key}={text}"
 
 
 def _pairs(option: str, text: str, known: Sequence[str]) -> dict[str, str]:
