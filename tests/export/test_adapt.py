@@ -8,8 +8,15 @@ from onnx import TensorProto, helper, numpy_helper
 
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 from cvo_export.graph.adapt import adapted, refuse_other_form
-from cvo_export.graph.adapt_options import read_input, read_outputs, read_size
+from cvo_export.graph.adapt_options import (
+    input_text,
+    output_text,
+    read_input,
+    read_outputs,
+    read_size,
+)
 from cvo_export.graph.external import read_onnx
+from cvo_export.graph.tensors import advice
 
 R = np.random.default_rng(3)
 IMAGE = R.integers(0, 256, (1, 16, 20, 3), dtype=np.uint8)
@@ -162,14 +169,67 @@ def test_weights_beside_the_file_are_read_into_it(tmp_path):
         read_onnx(tmp_path / "mine.onnx")
 
 
-def test_without_options_the_message_names_those_that_may_fit():
+@pytest.mark.parametrize(
+    ("counts", "shape", "advice"),
+    [
+        (
+            {"out": 7},
+            (1, 3, 224, 224),
+            "state them, e.g. --input layout=nchw,range=0-1 --output pose=out",
+        ),
+        (
+            {"q": 4, "feature": 64, "xyz": 3, "lower": 6, "upper": 6},
+            ("n", "h", "w", 3),
+            "state them, e.g. --input layout=nhwc,range=0-1 --size HEIGHTxWIDTH --output "
+            "translation=xyz --output rotation=q --output lower=lower --output upper=upper",
+        ),
+        (
+            {"turn": 3, "position": 3},
+            (1, 3, 64, 64),
+            "state them, e.g. --input layout=nchw,range=0-1 --output translation=position --output "
+            "rotation=turn,form=rotvec",
+        ),
+        ({"out": 5}, (1, 3, 64, 64), "no output has the size of a pose; export it with outputs"),
+        ({"out": 7}, (8, 3, 64, 64), "export it for one image, [1, 3, H, W] or [1, H, W, 3]"),
+    ],
+)
+def test_without_options_the_message_names_those_that_may_fit(counts, shape, advice):
     with pytest.raises(BundleMismatchError) as caught:
-        refuse_other_form(network({"out": 7}, (1, 3, 224, 224)))
-    assert str(caught.value) == (
-        "model: expected the input image uint8 [1, height, width, 3] and the output pose [1, 7], "
-        "found input x float [1, 3, 224, 224] and outputs out: state them, e.g. --input "
-        "layout=nchw,range=0-1 --output pose=out"
-    )
+        refuse_other_form(network(counts, shape))
+    text = str(caught.value)
+    sizes = ", ".join("?" if isinstance(size, str) else str(size) for size in shape)
+    outputs = ", ".join(f"{name} float32 [?, {count}]" for name, count in counts.items())
+    assert f"found inputs x float32 [{sizes}]; outputs {outputs}; {advice}" in text
+
+
+def test_an_image_with_other_outputs_needs_only_their_names():
+    model = network({"out": 7}, (1, 16, 20, 3), TensorProto.UINT8)
+    model.graph.input[0].name = "image"
+    assert advice(model) == "state them, e.g. --output pose=out"
+    with pytest.raises(UsageError, match="expected layout or order alone for image uint8"):
+        adapt(model, "range=0-1", ["pose=out"])
+
+
+@pytest.mark.parametrize(
+    ("inputs", "named"),
+    [
+        ({"x": (1, 3, 16, 20), "state": (1, 8)}, "x float32 [1, 3, 16, 20], state float32 [1, 8]"),
+        ({"x": (1, 5, 3, 16, 20)}, "x float32 [1, 5, 3, 16, 20]"),
+    ],
+)
+def test_sequences_and_states_are_refused_with_a_way_out(inputs, named):
+    model = network({"out": 7})
+    del model.graph.input[:]
+    for name, shape in inputs.items():
+        value = helper.make_tensor_value_info(name, TensorProto.FLOAT, list(shape))
+        model.graph.input.append(value)
+    for refused in (
+        lambda: adapt(model, "range=0-1", ["pose=out"]),
+        lambda: refuse_other_form(model),
+    ):
+        with pytest.raises(BundleMismatchError) as caught:
+            refused()
+        assert f"found inputs {named}; outputs out float32 [?, 7]; export it" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -188,6 +248,13 @@ def test_options_that_do_not_fit_are_refused(given, outputs, size, message):
     with pytest.raises(UsageError) as caught:
         adapt(network({"out": 7}), given, outputs, size)
     assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize("text", ["", "name=x,layout=nchw,range=0-1,order=bgr,mean=0.5/0.4/0.3"])
+def test_forms_are_written_as_they_are_read(text):
+    assert input_text(read_input(text)) == text
+    outputs = ["translation=t,unit=mm", "rotation=r,form=matrix,direction=world_to_camera"]
+    assert [output_text(role, form) for role, form in read_outputs(outputs).items()] == outputs
 
 
 def test_an_output_of_another_length_is_refused():

@@ -1,4 +1,4 @@
-"""Try a network on a few frames; if it is no better than their mean pose, try other forms of it.
+"""Try a network on a few frames; if it is hardly better than their mean pose, try other forms.
 
 A wrong quaternion order, direction, unit, channel order or range makes a good network look bad. The
 forms of its outputs are compared without running it again. Nothing is applied: the forms that would
@@ -7,8 +7,10 @@ fit are named, and whoever knows the network decides.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -17,7 +19,8 @@ import onnx
 import onnxruntime
 from numpy.typing import NDArray
 
-from cvo_edge.errors import CvoError, SourceError
+from cvo_edge.engine.session import one_line
+from cvo_edge.errors import ModelError, SourceError
 from cvo_edge.input import preprocess
 from cvo_edge.pose import about
 from cvo_edge.vocabulary import Crop
@@ -30,8 +33,10 @@ Array = NDArray[np.float64]
 Outputs = Mapping[str, OutputForm]
 
 _FRAMES = 24
-# A form fits if its errors, as shares of the mean pose's, are this small on average.
-_FITS = 0.8
+# Errors as shares of the mean pose's. From the first on, other forms are tried: where a camera
+# turns round, a wrong rotation is as good as the mean one. A form fits if its shares are this small
+# on average, and this much smaller than those of the stated form.
+_DOUBTFUL, _FITS, _GAIN = 0.5, 0.8, 0.7
 # Forms whose errors are this much larger than the least are worth naming.
 _NEAR = 1.25
 _NAMED = 3
@@ -48,6 +53,10 @@ _FORMS = (
     ("rotvec", "logq"),
     ("six", "six_rows"),
     ("matrix",),
+)
+_NONE_FITS = (
+    "no other quaternion order, direction, axes, unit, channel order, range, crop or size that was "
+    "tried fits either; is it a network of this place and this world frame?"
 )
 # A quaternion of another length is probably none.
 _NORMS = 0.5, 2.0
@@ -132,29 +141,34 @@ def tried(
     def try_on(forms: Sequence[Form]) -> Iterator[Tried]:
         """Run the network once for forms that differ in their outputs alone."""
         own = _run(model, forms[0], images)
-        for each in forms if own is not None else ():
-            error = median_error(_poses(own or [], each.outputs), truth)
+        for each in forms:
+            error = median_error(_poses(own, each.outputs), truth)
             yield Tried(each, error, error.shares(mean))
 
-    now = next(try_on([form]), None)
-    if now is None or max(now.shares) < 1.0:
+    (now,) = try_on([form])
+    if max(now.shares) < _DOUBTFUL:
         return []
     found = [each for given in _inputs(form.given) for each in try_on(_readings(form, given))]
     best = min(found, key=lambda each: each.score, default=now)
-    for size, crop in _views(best.form, dataset.image_size(int(chosen[0]))):
+    for size, crop in _views(best.form, images[0].shape[:2]):
         viewed = replace(best.form, size=size, crop=crop)
-        found += try_on(_readings(viewed, best.form.given))
+        # A network may run at its own size alone.
+        with contextlib.suppress(ModelError):
+            found += try_on(_readings(viewed, best.form.given))
+    named = _named(form, now, found, stated)
+    if max(now.shares) < 1.0:
+        return named
     return [
         f"warning: the network is no better than the mean pose of {len(read)} frames of val: "
         f"median error {now.error}, of the mean pose {mean}{_length_text(model, form, images)}",
-        *_named(form, now, found, stated),
+        *(named or [_NONE_FITS]),
     ]
 
 
 def _named(form: Form, now: Tried, found: Sequence[Tried], stated: bool) -> list[str]:
     """Return a line for each form that fits with the fewest changes."""
-    fits = [each for each in found if max(each.shares) < 1.0 and each.score < _FITS * now.score]
-    fits = [each for each in fits if each.score < _FITS]
+    limit = min(_FITS, _GAIN * now.score)
+    fits = [each for each in found if max(each.shares) < 1.0 and each.score < limit]
     least = min((each.score for each in fits), default=0.0)
     near = [each for each in fits if each.score <= _NEAR * least]
     fewest = min((form.changes(each.form) for each in near), default=0)
@@ -164,9 +178,6 @@ def _named(form: Form, now: Tried, found: Sequence[Tried], stated: bool) -> list
         f"with {form.options(each.form, stated)} the median error would be {each.error} instead of "
         f"{now.error}"
         for each in near[:_NAMED]
-    ] or [
-        "no other quaternion order, direction, axes, unit, channel order, range, crop or size that "
-        "was tried fits either; is it a network of this place and this world frame?"
     ]
 
 
@@ -181,24 +192,22 @@ def _image(dataset: PoseDataset, index: int) -> Iterator[NDArray[np.uint8]]:
 
 def _run(
     model: onnx.ModelProto, form: Form, images: Sequence[NDArray[np.uint8]]
-) -> list[dict[str, NDArray[Any]]] | None:
-    """Return the network's own outputs for each image, or None if it does not run."""
+) -> list[dict[str, NDArray[Any]]]:
+    """Return the network's own outputs for each image; raises ModelError if it does not run."""
     names = sorted({each.name for each in form.outputs.values()})
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
+    content, prefix, (height, width) = image_before(model, form.given, form.size)
+    own = []
     try:
-        content, prefix, (height, width) = image_before(model, form.given, form.size)
         engine = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        own = []
         for image in images:
-            tensor = preprocess.model_input(image, height, width, form.crop)[np.newaxis]
+            tensor = preprocess.model_input(image, height, width, form.crop)
             values = engine.run([prefix + name for name in names], {"image": tensor})
             own.append(dict(zip(names, values, strict=True)))
-    except CvoError:
-        return None
     # onnxruntime raises a dozen unrelated types here.
-    except Exception:  # noqa: BLE001
-        return None
+    except Exception as error:  # noqa: BLE001
+        raise ModelError(f"model: does not run at {height}x{width}: {one_line(error)}") from None
     return own
 
 
@@ -213,8 +222,7 @@ def _poses(own: Sequence[Mapping[str, NDArray[Any]]], outputs: Outputs) -> Array
 def _read(own: Sequence[Mapping[str, NDArray[Any]]], outputs: Outputs) -> Array:
     of_pose = {role: each for role, each in outputs.items() if role not in ("lower", "upper")}
     shapes = {name: values.shape for name, values in own[0].items()}
-    content, ports = pose_behind(of_pose, shapes)
-    engine = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    engine, ports = _reader(tuple(of_pose.items()), tuple(shapes.items()))
     rows = [
         engine.run(None, {port: np.float32(each[name]) for name, port in ports.items()})[0][0]
         for each in own
@@ -222,11 +230,23 @@ def _read(own: Sequence[Mapping[str, NDArray[Any]]], outputs: Outputs) -> Array:
     return np.array(rows, np.float64)
 
 
+@lru_cache(maxsize=32)
+def _reader(
+    outputs: tuple[tuple[str, OutputForm], ...], shapes: tuple[tuple[str, tuple[int, ...]], ...]
+) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
+    """Return the graph that reads outputs of these shapes; every input is read in every form."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    content, ports = pose_behind(dict(outputs), dict(shapes))
+    providers = ["CPUExecutionProvider"]
+    return onnxruntime.InferenceSession(content, options, providers=providers), ports
+
+
 def _length_text(model: onnx.ModelProto, form: Form, images: Sequence[NDArray[np.uint8]]) -> str:
     """Say if what is read as a quaternion is none."""
     own = _run(model, form, images[:1])
     (turn,) = [each for role, each in form.outputs.items() if role in ("pose", "rotation")]
-    if own is None or not turn.form.startswith("quaternion"):
+    if not turn.form.startswith("quaternion"):
         return ""
     length = float(np.linalg.norm(_read(own, form.outputs)[0, 3:]))
     if _NORMS[0] <= length <= _NORMS[1]:
