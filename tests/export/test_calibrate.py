@@ -294,7 +294,7 @@ def test_a_network_is_calibrated_where_torch_is_not_installed(model_file, tmp_pa
         (b"no model at all", ModelError, "expected an ONNX file, found something else"),
         (None, ModelError, "expected an ONNX file or a bundle folder"),
         ({"outputs": ("place", "lower", "upper")}, BundleMismatchError, "pose"),
-        ({"outputs": ("pose", "low", "high")}, BundleMismatchError, "found image uint8"),
+        ({"outputs": ("pose", "low", "high")}, BundleMismatchError, "found inputs image uint8"),
         ({"height": 8, "width": 8}, BundleMismatchError, "at least 16x16 pixels, found 8x8"),
     ],
 )
