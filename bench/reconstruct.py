@@ -2,18 +2,21 @@
 
     python bench/reconstruct.py trajectory DATASET [--frames 100 300] [--json FILE]
     python bench/reconstruct.py tag [--json FILE]
+    python bench/reconstruct.py trained EVALUATION... [--json FILE]
 
 ``trajectory`` reconstructs the images of a data set without their poses and compares positions
 after the best similarity: with the data set's intrinsics for each number of images, and for the
 first number also by the incremental mapper and with estimated intrinsics. ``apart_cm`` is the
 median distance between the map and the first one on the images of both: it does not depend on the
 data set's poses. ``tag`` reconstructs the synthetic room with a tag of 0.2 m: the error of the
-scale.
+scale. ``trained`` collects what ``cvo-export evaluate --json`` wrote of bundles that were trained
+on a reconstruction.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,6 +41,7 @@ Array = NDArray[np.float64]
 ROOM, EVERY, TAG_M = "synthetic:room,flights=1,frames=300,size=640x480,tag=0.2", 6, 0.2
 # Most images are then a frame or two apart, so that the number of images decides.
 STEP = 0.01
+CONFIDENCE = 0.9
 
 
 def measured(
@@ -148,21 +152,39 @@ def tag() -> dict[str, Any]:
         }
 
 
+def trained(files: list[str]) -> dict[str, Any]:
+    """Return error and coverage of each evaluation, at 0.9."""
+    found: dict[str, Any] = {}
+    for file in files:
+        content = json.loads(Path(file).read_text("utf-8"))
+        kept = ("method", "split", "rule", "score", "frames", "n_calibration", "point_error")
+        found[Path(file).stem] = {key: content[key] for key in kept} | {
+            "levels": [level for level in content["levels"] if level["confidence"] == CONFIDENCE]
+        }
+    return found
+
+
 def main() -> None:
     """Run the measurement that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["trajectory", "tag"])
-    parser.add_argument("dataset", nargs="?")
+    parser.add_argument("what", choices=["trajectory", "tag", "trained"])
+    parser.add_argument("given", nargs="*")
     parser.add_argument("--frames", nargs="+", type=int, default=[100, 300])
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
-    if given.what == "trajectory" and given.dataset is None:
-        parser.error("trajectory needs a data set")
-    found = tag() if given.what == "tag" else trajectory(given.dataset, given.frames)
+    arguments = parser.parse_args()
+    match arguments.what, arguments.given:
+        case "tag", []:
+            found = tag()
+        case "trajectory", [dataset]:
+            found = trajectory(dataset, arguments.frames)
+        case "trained", [_, *_]:
+            found = trained(arguments.given)
+        case _:
+            parser.error("expected one data set after trajectory, files after trained")
     for name, figures in found.items():
         print(name, *(f"{key} {value}" for key, value in figures.items()), sep="\n  ")
-    if given.json is not None:
-        write_result(given.json, found)
+    if arguments.json is not None:
+        write_result(arguments.json, found)
 
 
 if __name__ == "__main__":
