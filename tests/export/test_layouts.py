@@ -194,6 +194,23 @@ def test_12_scenes_files_that_are_malformed_are_refused(tmp_path, file, text, ex
         open_dataset(f"12scenes:{folder}")
 
 
+@pytest.mark.parametrize("below", ["", "data"])
+def test_12_scenes_read_as_7_scenes_are_refused(tmp_path, below):
+    scene = twelve_scenes(tmp_path / "a", (48, 64))
+    with pytest.raises(SourceError, match=rf"split.txt of 12-Scenes .* as 12scenes:{scene}$"):
+        open_dataset(f"7scenes:{scene / below}")
+
+
+@pytest.mark.parametrize("name", ["mocap0", "gt_imu"])
+def test_tum_vi_read_as_euroc_is_refused(tmp_path, name):
+    folder = tum_vi(tmp_path / "room1", [(0.0, 0.1)], 0.05)
+    if name == "gt_imu":
+        (folder / "mav0" / "mocap0" / "data.csv").rename(folder / "dso" / "gt_imu.csv")
+        (folder / "mav0" / "mocap0").rmdir()
+    with pytest.raises(SourceError, match=f"^{folder}: .* of TUM-VI; read it as tum-vi:{folder}$"):
+        open_dataset(f"euroc:{folder}")
+
+
 def scannet(folder, size=(968, 1296)):
     for number, T in zip((0, 2, 10, 20, 30), matrices(5), strict=True):
         image(folder / "color" / f"{number}.jpg", size)

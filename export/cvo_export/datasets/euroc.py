@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.errors import SourceError
 from cvo_edge.trajectories.euroc import MAX_STAMP_DIFFERENCE_NS, read_euroc
 from cvo_edge.trajectories.tables import read_rows
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
@@ -28,6 +29,8 @@ Array = NDArray[np.float64]
 _IMAGES = "mav0/cam0/data.csv"
 _CAMERA = "mav0/cam0/sensor.yaml"
 _POSES = "mav0/state_groundtruth_estimate0/data.csv"
+# TUM-VI has the same folders of images.
+_OF_TUM_VI = ("mav0/mocap0", "dso")
 
 
 def open_euroc(path: str) -> PoseDataset:
@@ -46,6 +49,11 @@ def open_euroc(path: str) -> PoseDataset:
     frames = FrameList(root)
     cameras: dict[str, tuple[Intrinsics, Lens] | None] = {}
     for name, folder in recordings(root, _IMAGES).items():
+        other = next((each for each in _OF_TUM_VI if (folder / each).is_dir()), None)
+        if other and not (folder / _POSES).is_file():
+            raise SourceError(
+                f"{folder}: expected {_POSES}, found {other} of TUM-VI; read it as tum-vi:{path}"
+            )
         cameras[name], T_body_camera = _read_camera(folder / _CAMERA)
         _add_recording(frames, name, folder, T_body_camera)
     dataset = frames.dataset(root.resolve().name)

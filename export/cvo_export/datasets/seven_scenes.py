@@ -21,6 +21,9 @@ from cvo_edge.trajectories.poses import MATRIX_SUFFIX, pose_matrix_fault, read_p
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.frames import FrameList
 
+# Files of a scene of 12-Scenes, whose frames have the same names.
+_TWELVE_SCENES = ("info.txt", "split.txt")
+
 # The Kinect's nominal focal length at 640x480, as stated by the data set's authors.
 _NOMINAL_FOCAL_PX, _NOMINAL_WIDTH = 585.0, 640
 
@@ -32,13 +35,19 @@ def open_seven_scenes(path: str) -> PoseDataset:
     Intrinsics come from ``camera-intrinsics.txt`` (a 3x3 matrix) if it exists, otherwise from the
     data set's nominal focal length, scaled to the images' width.
 
-    Raises SourceError if no frame has a pose.
+    Raises SourceError if no frame has a pose, or for a scene of 12-Scenes.
     """
     root = Path(path)
     if not root.is_dir():
         raise SourceError(f"{root}: expected a 7-Scenes folder, found no folder")
     folders = sorted(root.glob("seq-*"), key=natural_key)
     folders = [folder for folder in folders if folder.is_dir()] or [root]
+    for scene in (root, root.absolute().parent):
+        if folders == [root] and all((scene / name).is_file() for name in _TWELVE_SCENES):
+            raise SourceError(
+                f"{root}: expected a 7-Scenes folder, found {' and '.join(_TWELVE_SCENES)} of "
+                f"12-Scenes in {scene}; read it as 12scenes:{scene}"
+            )
     frames = FrameList(root)
     for folder in folders:
         for image in frames.colour_images(folder):
