@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -15,6 +15,7 @@ from cvo_edge.files import read_regular_file
 from cvo_edge.input.capture import shown
 from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image
 from cvo_edge.input.frame import Frame
+from cvo_edge.input.stamps import read_stamps, stamps_in_names
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 
@@ -46,23 +47,36 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
 
 
 class ImageFiles:
-    """Image files in the given order; an unreadable file is a frame without an image."""
+    """Image files in the given order; an unreadable file is a frame without an image.
+
+    Frames are stamped by ``stamps`` (see ``read_stamps``), by a rate, or by their names if all are
+    stamps since 1970.
+    """
 
     live = False
 
-    def __init__(self, listing: Listing, fps: float | None, if_empty: str) -> None:
+    def __init__(
+        self, listing: Listing, fps: float | None, if_empty: str, stamps: str | None = None
+    ) -> None:
         paths, self.left_out = listing
         if not paths:
             reasons = f"; left out {left_out_text(self.left_out)}" if self.left_out else ""
             raise SourceError(if_empty + reasons)
         self._paths = paths
-        self._fps = fps
+        names = [frame_name(path.name) for path in paths]
+        self._stamps_ns: Sequence[int | None]
+        if stamps is not None:
+            self._stamps_ns = read_stamps(stamps, names, [path.name for path in paths])
+        elif fps is not None:
+            self._stamps_ns = [stamp_at(seq, fps) for seq in range(len(paths))]
+        else:
+            self._stamps_ns = stamps_in_names(names) or [None] * len(paths)
         self.length: int | None = len(paths)
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield one call a file."""
-        for seq, path in enumerate(self._paths):
-            yield partial(_read_file, path, stamp_at(seq, self._fps))
+        for path, stamp_ns in zip(self._paths, self._stamps_ns, strict=True):
+            yield partial(_read_file, path, stamp_ns)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield one frame a file."""

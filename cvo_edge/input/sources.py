@@ -47,7 +47,10 @@ T = TypeVar("T")
 
 
 def open_source(
-    source: str | os.PathLike[str] | int, fps: float | None = None, timeout_s: float = TIMEOUT_S
+    source: str | os.PathLike[str] | int,
+    fps: float | None = None,
+    timeout_s: float = TIMEOUT_S,
+    stamps: str | None = None,
 ) -> Source:
     """Open a folder of images, a glob, a video file, a camera or a stream.
 
@@ -62,43 +65,59 @@ def open_source(
         Frames per second to stamp frames with, starting at zero, instead of the source's own.
     timeout_s
         Longest wait for the next frame of a video or camera; opening may take twice as long.
+    stamps
+        Where the stamps of image files are: ``names``, or a file such as ``rgb.txt``, ``data.csv``
+        or ``times.txt`` (see ``cvo_edge.input.stamps``).
 
     Raises
     ------
     SourceError
         There is no such source, or it holds no image.
     UsageError
-        ``source`` is of another type, or ``fps`` or ``timeout_s`` is out of range.
+        ``source`` is of another type, ``fps`` or ``timeout_s`` is out of range, or ``stamps`` is
+        given with ``fps`` or without image files.
     """
     text = _text(source)
     if fps is not None and not LOWEST_FPS <= fps <= HIGHEST_FPS:
         raise UsageError(f"fps: expected {LOWEST_FPS:g} to {HIGHEST_FPS:g}, found {fps:g}")
     if not 0.0 < timeout_s <= LONGEST_S:
         raise UsageError(f"timeout: expected up to {LONGEST_S:g} s, found {timeout_s:g}")
+    if stamps is not None and fps is not None:
+        raise UsageError("stamps: expected no fps beside them, found both")
     path = Path(text)
     try:
         path.exists()
     except OSError as error:
         raise SourceError(f"{shown(text)}: not a usable name: {error.strerror}") from None
     if path.is_dir():
-        return ImageFiles(images_in(path), fps, f"{path}: expected images, found none")
+        return ImageFiles(images_in(path), fps, f"{path}: expected images, found none", stamps)
     if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
         raise SourceError(f"{shown(text)}: expected a file's path, found a file address")
     if names_camera(text):
+        _refuse_stamps(stamps, text)
         return Camera(int(text) if text.isdecimal() else text, fps, timeout_s)
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES or _is_one_image(path):
-            return ImageFiles(Listing([path], {}), fps, "")
+            return ImageFiles(Listing([path], {}), fps, "", stamps)
+        _refuse_stamps(stamps, text)
         return Video(path, fps, timeout_s)
     if glob.has_magic(text):
         found = [Path(name) for name in glob.glob(text, recursive=True) if Path(name).is_file()]
         return ImageFiles(
-            colour_images(found), fps, f"{shown(text)}: expected images, found no match"
+            colour_images(found), fps, f"{shown(text)}: expected images, found no match", stamps
         )
     raise SourceError(
         f"{shown(text)}: not found; expected a folder, glob, video file, camera index, device or "
         "address"
     )
+
+
+def _refuse_stamps(stamps: str | None, text: str) -> None:
+    if stamps is not None:
+        raise UsageError(
+            f"stamps: expected a folder of images, whose stamps they are, found {shown(text)}, "
+            "which has its own"
+        )
 
 
 def _text(source: str | os.PathLike[str] | int) -> str:

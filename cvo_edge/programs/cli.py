@@ -30,6 +30,7 @@ from cvo_edge.programs.options import (
     OutputOption,
     PublicKeyOption,
     RegionOption,
+    StampsOption,
     StateOption,
     ThreadsOption,
     TimeoutOption,
@@ -113,6 +114,7 @@ def run(
         float | None,
         typer.Option(help="Stamp frames at this rate, from zero.", rich_help_panel="Input"),
     ] = None,
+    stamps: StampsOption = None,
     camera: CameraOption = None,
     expect_motion: ExpectMotionOption = False,
     max_frames: MaxFramesOption = None,
@@ -138,10 +140,11 @@ def run(
     if label_delay and labels is None:
         raise UsageError("--label-delay: expected --labels FILE with it, found no labels")
     written_as = format_of(output, format)
-    refuse_overwriting(output, source, ground_truth, bundle, public_key, camera, labels, state)
-    truth = open_ground_truth(ground_truth) if ground_truth else None
-    labelled = open_ground_truth(labels) if labels else None
-    frames = open_source(source, fps, timeout)
+    read = (source, ground_truth, bundle, public_key, camera, labels, state, stamps)
+    refuse_overwriting(output, *read)
+    truth = open_ground_truth(ground_truth, source) if ground_truth else None
+    labelled = open_ground_truth(labels, source) if labels else None
+    frames = open_source(source, fps, timeout, stamps)
     with Odometer.load(
         bundle,
         threads=threads,

@@ -60,6 +60,17 @@ CameraOption = Annotated[
         rich_help_panel="Input",
     ),
 ]
+StampsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--stamps",
+        metavar="<names|FILE>",
+        help="Where the stamps of images are: in their names, or in rgb.txt, data.csv or "
+        "times.txt.",
+        show_default=False,
+        rich_help_panel="Input",
+    ),
+]
 ExpectMotionOption = Annotated[
     bool,
     typer.Option(
@@ -120,7 +131,8 @@ TimeoutOption = Annotated[
 GroundTruthOption = Annotated[
     Path | None,
     typer.Option(
-        help="TUM file or folder of .pose.txt; adds coverage to the summary.",
+        help="True poses (7-Scenes, TUM, EuRoC, KITTI, COLMAP, transforms.json); adds coverage to "
+        "the summary.",
         readable=False,
         rich_help_panel=REPORT,
     ),
@@ -129,8 +141,7 @@ LabelsOption = Annotated[
     Path | None,
     typer.Option(
         "--labels",
-        help="TUM file or folder of .pose.txt with true poses of some frames; the intervals "
-        "adapt to them.",
+        help="True poses of some frames, as for --ground-truth; the intervals adapt to them.",
         readable=False,
         show_default=False,
         rich_help_panel=ADAPTATION,

@@ -100,7 +100,7 @@ class RunSummary:
     def match_text(self, truth: GroundTruth) -> str:
         """Return how many frames have a true pose, and what frames and poses were matched by."""
         spans = truth.spans(self._first_key, self._last_key)
-        return f"{self.matched} of {self.frames} frames matched by {truth.by} ({spans})"
+        return f"{self.matched} of {self.frames} frames matched by {truth.found.by} ({spans})"
 
     def _drift_text(self, drift: Drift) -> str:
         if drift.state == "unknown":
@@ -195,12 +195,10 @@ def _short(value: float, unit: str) -> str:
 
 
 def _truth_lines(summary: RunSummary, truth: GroundTruth) -> list[str]:
-    lines = []
-    if truth.skipped:
-        lines.append(f"true poses  {truth.skipped}")
+    said = [truth.found.note, str(truth.skipped) if truth.skipped else ""]
     if 2 * summary.matched < summary.frames:
-        lines.append(f"true poses  {summary.match_text(truth)}")
-    return lines
+        said.append(summary.match_text(truth))
+    return [f"true poses  {text}" for text in said if text]
 
 
 def _adapted_line(adapted: Adapted) -> str:

@@ -87,13 +87,13 @@ def pose_matrix_fault(path: Path) -> str | None:
     return matrix_fault(T) if T.size == 16 else f"{T.size or 'no'} numbers instead of 16"
 
 
-def read_pose_matrices(folder: Path) -> Trajectory[str]:
-    """Read the ``.pose.txt`` of a folder, by frame name; raises SourceError if none is valid."""
+def read_pose_matrices(folder: Path, suffix: str) -> Trajectory[str]:
+    """Read the matrices of a folder, by frame name; raises SourceError if none is valid."""
     entries = []
-    for file in sorted(folder.glob("*" + MATRIX_SUFFIX)):
+    for file in sorted(folder.glob("*" + suffix)):
         pose = read_pose_matrix(file)
         fault = pose_matrix_fault(file) if pose is None else None
-        entries.append(Entry(file.name.removesuffix(MATRIX_SUFFIX), pose, file.name, fault))
+        entries.append(Entry(file.name.removesuffix(suffix), pose, file.name, fault))
     return trajectory_of(folder, entries)
 
 

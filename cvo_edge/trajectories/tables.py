@@ -127,6 +127,14 @@ def read_text(path: Path, form: str) -> str:
         ) from None
 
 
+def first_line(text: str) -> tuple[int, str]:
+    """Return the first line that is no comment, after its number; 0 and no text without one."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            return number, line.strip()
+    return 0, ""
+
+
 def seconds_to_ns(text: str) -> int:
     """Decimal seconds as text -> integer nanoseconds; raises ValueError if it is not a number."""
     seconds, _, fraction = text.partition(".")

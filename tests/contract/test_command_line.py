@@ -267,7 +267,7 @@ def test_ground_truth_that_matches_nothing_is_said(bundle_dir, clip_dir, tmp_pat
     assert result.returncode == 6
     assert (
         "expected true poses of the frames, found 0 of 1 frames matched by stamp (frames without a "
-        "stamp, poses at 1.000 .. 1.000 s)" in result.stderr
+        "stamp, poses at 1.000 .. 1.000 s; --stamps or --fps stamps frames)" in result.stderr
     )
 
 

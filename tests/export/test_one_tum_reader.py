@@ -88,7 +88,6 @@ BUT_SECOND = {"1.000": 10.0, "3.000": 30.0}
             "expected poses, found no valid one: groundtruth.txt, line 2: a number that is not",
             None,
         ),
-        ("# a\n", "expected poses, found none", None),
         (PLAIN + "4.0 1 2 3\n", "found '4.0 1 2 3' in line 4", None),
     ],
 )

@@ -1,18 +1,15 @@
 """COLMAP sparse models (Schoenberger and Frahm 2016): text or binary, with the images beside them.
 
 ``cameras``, ``images`` and ``points3D`` are files ``.bin`` or ``.txt``; the points are not read.
-An image has ``qw qx qy qz tx ty tz`` of ``T_camera_world``, the inverse of the pose here, for an
-OpenCV camera. A model knows lengths up to a factor only, unless its author has scaled it to metres.
+Poses are read as ``cvo_edge.trajectories.colmap`` describes.
 COLMAP gives the centre of the first pixel the coordinates (0.5, 0.5), this project (0, 0).
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +17,7 @@ from numpy.typing import NDArray
 from cvo_edge.camera import Camera, Distortion
 from cvo_edge.errors import SourceError
 from cvo_edge.input.image_files import natural_key
-from cvo_edge.pose import Pose
-from cvo_edge.trajectories.poses import quaternion_pose
+from cvo_edge.trajectories.colmap import Bytes, model_folder, read_images, refusal
 from cvo_edge.trajectories.tables import read_text
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera
@@ -47,15 +43,7 @@ _MODELS: tuple[tuple[str, int, Distortion | None], ...] = (
 )
 # These have two focal lengths.
 _TWO_FOCALS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
-_MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0")
 _CAMERA_FORM = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
-_IMAGE_FORM = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-
-
-class _Image(NamedTuple):
-    name: str
-    camera: int
-    pose: Array | None
 
 
 def open_colmap(path: str) -> PoseDataset:
@@ -72,7 +60,7 @@ def open_colmap(path: str) -> PoseDataset:
     folder = _model_folder(root)
     binary = (folder / "images.bin").is_file()
     cameras = dict(_binary_cameras(folder) if binary else _text_cameras(folder))
-    found = list(_binary_images(folder) if binary else _text_images(folder))
+    found = read_images(folder / f"images.{'bin' if binary else 'txt'}")
     images = _image_folder(root, folder)
     frames = FrameList(root)
     name = root.resolve().name
@@ -106,14 +94,13 @@ def open_colmap(path: str) -> PoseDataset:
 
 
 def _model_folder(root: Path) -> Path:
-    for below in _MODEL_FOLDERS:
-        for suffix in (".bin", ".txt"):
-            if all((root / below / (part + suffix)).is_file() for part in ("cameras", "images")):
-                return root / below
-    raise SourceError(
-        f"{root}: expected cameras.bin and images.bin, or cameras.txt and images.txt, there or in "
-        "sparse/0, found neither"
-    )
+    folder = model_folder(root)
+    if folder is None:
+        raise SourceError(
+            f"{root}: expected cameras.bin and images.bin, or cameras.txt and images.txt, there or "
+            "in sparse/0, found neither"
+        )
+    return folder
 
 
 def _image_folder(root: Path, folder: Path) -> Path:
@@ -157,14 +144,6 @@ def camera_of(where: str, model: str, size: tuple[int, int], values: list[float]
     )
 
 
-def _pose(q_wxyz: Array, t: Array) -> Array | None:
-    world_to_camera = quaternion_pose(t, np.roll(q_wxyz, -1))
-    if world_to_camera is None:
-        return None
-    T = np.linalg.inv(Pose.from_array(world_to_camera).to_matrix())
-    return Pose.from_matrix(T).to_array()
-
-
 def _text_cameras(folder: Path) -> Iterator[tuple[int, Camera]]:
     path = folder / "cameras.txt"
     for number, line in enumerate(read_text(path, _CAMERA_FORM).splitlines(), start=1):
@@ -175,74 +154,13 @@ def _text_cameras(folder: Path) -> Iterator[tuple[int, Camera]]:
             size, numbers = (int(width), int(height)), [float(value) for value in values]
             key = int(identity)
         except ValueError:
-            raise _refusal(path, _CAMERA_FORM, line, number) from None
+            raise refusal(path, _CAMERA_FORM, line, number) from None
         yield key, camera_of(f"{path}: line {number}", model, size, numbers)
-
-
-def _text_images(folder: Path) -> Iterator[_Image]:
-    path = folder / "images.txt"
-    lines = iter(enumerate(read_text(path, _IMAGE_FORM).splitlines(), start=1))
-    for number, line in lines:
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        fields = line.split(maxsplit=9)
-        try:
-            values = np.array(fields[1:8], dtype=np.float64)
-            camera, name = int(fields[8]), fields[9].strip()
-        except (ValueError, IndexError):
-            raise _refusal(path, _IMAGE_FORM, line, number) from None
-        yield _Image(name, camera, _pose(values[:4], values[4:]))
-        # The second line of an image lists its keypoints and may be empty.
-        next(lines, None)
-
-
-def _refusal(path: Path, form: str, line: str, number: int) -> SourceError:
-    return SourceError(f"{path}: expected {form}, found {line[:80]!r} in line {number}")
-
-
-class _Bytes:
-    """Reads little-endian numbers of a file; raises SourceError at its end."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.place = 0
-        try:
-            self._content = path.read_bytes()
-        except OSError as error:
-            raise SourceError(
-                f"{path}: expected a file of COLMAP, but it cannot be read: {error.strerror}"
-            ) from None
-
-    def take(self, form: str) -> tuple[Any, ...]:
-        try:
-            found = struct.unpack_from("<" + form, self._content, self.place)
-        except struct.error:
-            raise self.refusal("more data; the file is cut short") from None
-        self.place += struct.calcsize("<" + form)
-        return found
-
-    def name(self) -> str:
-        end = self._content.find(b"\0", self.place)
-        if end < 0:
-            raise self.refusal("a name that ends")
-        name, self.place = self._content[self.place : end], end + 1
-        return name.decode("utf-8", "surrogateescape")
-
-    def skip(self, count: int) -> None:
-        if count > len(self._content) - self.place:
-            raise self.refusal("more data; the file is cut short")
-        self.place += count
-
-    def refusal(self, expected: str) -> SourceError:
-        return SourceError(
-            f"{self._path}: expected {expected}, found {len(self._content)} bytes (at byte "
-            f"{self.place})"
-        )
 
 
 def _binary_cameras(folder: Path) -> Iterator[tuple[int, Camera]]:
     path = folder / "cameras.bin"
-    content = _Bytes(path)
+    content = Bytes(path)
     (count,) = content.take("Q")
     for _ in range(count):
         identity, model, width, height = content.take("iiQQ")
@@ -251,14 +169,3 @@ def _binary_cameras(folder: Path) -> Iterator[tuple[int, Camera]]:
         name, parameters, _ = _MODELS[model]
         values = list(content.take(f"{parameters}d"))
         yield identity, camera_of(f"{path}: camera {identity}", name, (width, height), values)
-
-
-def _binary_images(folder: Path) -> Iterator[_Image]:
-    content = _Bytes(folder / "images.bin")
-    (count,) = content.take("Q")
-    for _ in range(count):
-        values = np.array(content.take("i7d")[1:])
-        (camera,) = content.take("i")
-        name = content.name()
-        content.skip(24 * content.take("Q")[0])
-        yield _Image(name, camera, _pose(values[:4], values[4:]))

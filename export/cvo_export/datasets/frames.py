@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cvo_edge.errors import SourceError
 from cvo_edge.input.decoding import decode_image, image_size
 from cvo_edge.input.image_files import frame_name, images_in
-from cvo_edge.trajectories.trajectory import LISTED_TWICE, Skipped
+from cvo_edge.trajectories.trajectory import LISTED_TWICE, Skipped, Trajectory
 from cvo_export.datasets.base import PoseDataset
 
 Array = NDArray[np.float64]
@@ -77,10 +77,14 @@ class FrameList:
         self,
         sequence: str,
         images: Mapping[int, Path],
-        poses: Sequence[Array | None],
+        trajectory: Trajectory[int],
         stamps_ns: Sequence[int] = (),
     ) -> None:
-        """Add images with poses (and stamps) of the same number; skip those without a partner."""
+        """Add images with poses (and stamps) of the same number; skip those without a partner.
+
+        The trajectory has poses 0, 1, ... without a gap.
+        """
+        poses = trajectory.poses
         for number in sorted(images.keys() | range(len(poses))):
             if number not in images:
                 self.skip("image missing")
@@ -89,7 +93,8 @@ class FrameList:
             else:
                 image = images[number]
                 stamp_ns = stamps_ns[number] if number < len(stamps_ns) else None
-                self.add(sequence, frame_name(image.name), image, poses[number], stamp_ns)
+                where = trajectory.faults.get(number, "")
+                self.add(sequence, frame_name(image.name), image, poses[number], stamp_ns, where)
 
     def skip(self, reason: str, where: str = "", count: int = 1) -> None:
         """Count skipped frames; ``where`` is the place of the reason, if it has one."""

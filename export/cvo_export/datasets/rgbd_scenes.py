@@ -1,10 +1,7 @@
 """RGB-D Scenes v2 (Lai et al. 2014): ``imgs/scene_NN/NNNNN-color.png`` with ``pc/NN.pose``.
 
-Line i of a pose file, counted from 0, belongs to image i and holds ``a b c d x y z``: the
-quaternion a + bi + cj + dk, scalar first, then the camera's position in metres. Together they are
-``T_world_camera`` of an OpenCV camera. The world frame is the first camera frame of the scene, so
-poses of different scenes are not comparable, and a data set is one scene. Depth images are not
-read.
+Poses are read as ``cvo_edge.trajectories.rgbd_scenes`` describes. Each scene has its own world
+frame, so a data set is one scene. Depth images are not read.
 """
 
 from __future__ import annotations
@@ -12,11 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from cvo_edge.input.image_files import natural_key
-from cvo_edge.trajectories.poses import quaternion_pose
-from cvo_edge.trajectories.tables import read_rows
+from cvo_edge.trajectories.rgbd_scenes import read_rgbd_scenes
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.folders import only_world
 from cvo_export.datasets.frames import FrameList
@@ -49,10 +43,7 @@ def open_rgbd_scenes(path: str) -> PoseDataset:
         if file.name.removesuffix(_COLOUR).isdecimal()
     }
     pose_file = folder.parent.parent / "pc" / f"{folder.name.removeprefix('scene_')}.pose"
-    rows = read_rows(pose_file, "a b c d x y z", comments=False)
-    numbers = [row.numbers() for row in rows]
-    poses = [quaternion_pose(values[4:], np.roll(values[:4], -1)) for values in numbers]
-    frames.add_numbered(folder.name, images, poses)
+    frames.add_numbered(folder.name, images, read_rgbd_scenes(pose_file))
     dataset = frames.dataset(folder.name)
     width = dataset.read_image(0).shape[1]
     return replace(dataset, intrinsics=_NOMINAL.scaled(width / _NOMINAL_WIDTH))

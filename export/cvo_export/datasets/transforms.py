@@ -1,13 +1,11 @@
 """nerfstudio and instant-ngp: ``transforms.json`` with images, poses and a camera.
 
-``transform_matrix`` of a frame is the 4x4 camera-to-world matrix of an OpenGL camera (x right, y
-up, z backward). Its units are metres only if its author scaled it. Principal points give the centre
+Poses are read as ``cvo_edge.trajectories.transforms`` describes. Principal points give the centre
 of the first pixel the coordinates (0.5, 0.5), this project (0, 0).
 """
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -18,15 +16,14 @@ from numpy.typing import NDArray
 
 from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
-from cvo_edge.trajectories.poses import matrix_to_pose
-from cvo_edge.trajectories.tables import read_text
+from cvo_edge.trajectories.transforms import FILE, frame_poses, read_document
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.colmap import camera_of
 from cvo_export.datasets.folders import only_camera
 from cvo_export.datasets.frames import FrameList
 
-_FILE = "transforms.json"
-_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+Array = NDArray[np.float64]
+
 # Files of the Blender data sets leave the suffix out.
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 
@@ -43,27 +40,22 @@ def open_nerfstudio(path: str) -> PoseDataset:
     pose.
     """
     given = Path(path)
-    file = given if given.is_file() else given / _FILE
-    document = _document(file)
+    file = given if given.is_file() else given / FILE
+    document = read_document(file)
     root = file.absolute().parent
     frames = FrameList(file)
-    listed: dict[str, list[tuple[str, Path, NDArray[np.float64] | None]]] = {}
-    for number, frame in enumerate(document["frames"]):
-        name = frame.get("file_path") if isinstance(frame, dict) else None
-        if not (isinstance(name, str) and "transform_matrix" in frame):
-            raise SourceError(
-                f"{file}: expected file_path and transform_matrix in frame {number}, found "
-                f"{str(frame)[:80]}"
-            )
+    listed: dict[str, list[tuple[str, Path, Array | None, str]]] = {}
+    for name, pose, where, fault in frame_poses(file, document):
         place = PurePosixPath(name)
         tried = [root / (name + suffix) for suffix in _SUFFIXES]
         image = next((each for each in tried if each.is_file()), tried[0])
         folder = place.parent.name
-        entry = (place.stem if image == tried[0] else place.name, image, _pose(frame))
+        fault_at = f"{where}: {fault}" if pose is None else ""
+        entry = (place.stem if image == tried[0] else place.name, image, pose, fault_at)
         listed.setdefault(folder or root.name, []).append(entry)
     for sequence, entries in listed.items():
-        for entry in entries:
-            frames.add(sequence, *entry)
+        for stem, image, pose, fault_at in entries:
+            frames.add(sequence, stem, image, pose, where=fault_at)
     dataset = frames.dataset(root.name)
     height, width = dataset.read_image(0).shape[:2]
     cameras = {
@@ -79,26 +71,6 @@ def open_nerfstudio(path: str) -> PoseDataset:
         intrinsics=Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy),
         lens=Lens(camera.distortion, camera.coefficients),
     )
-
-
-def _document(file: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(read_text(file, "frames with file_path and transform_matrix"))
-    except (ValueError, RecursionError) as error:
-        raise SourceError(f"{file}: expected JSON, found {error}") from None
-    if not (isinstance(document, dict) and isinstance(document.get("frames"), list)):
-        raise SourceError(f"{file}: expected a list frames, found none")
-    return document
-
-
-def _pose(frame: dict[str, Any]) -> NDArray[np.float64] | None:
-    try:
-        T = np.array(frame["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    if T.shape == (3, 4):
-        T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
-    return matrix_to_pose(T @ _AXES) if T.shape == (4, 4) else None
 
 
 def _camera(file: Path, values: dict[str, Any], size: tuple[int, int]) -> Camera | None:

@@ -1,0 +1,98 @@
+"""Ground-truth poses from files, matched with the frames of a run."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.estimate import PoseInterval
+from cvo_edge.ground_truth.detect import Found, find_trajectory
+from cvo_edge.input.image_files import frame_name
+from cvo_edge.trajectories.trajectory import Skipped, nearest_stamp
+
+Array = NDArray[np.float64]
+Key = int | str
+
+# Digits of a frame's number; longer names are stamps.
+_LONGEST = 10
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """True poses for comparison with estimates; see ``open_ground_truth``."""
+
+    found: Found
+
+    def pose_of(self, estimate: PoseInterval) -> Array | None:
+        """Return the true ``T_world_camera`` (7,) of an estimate's frame, or None."""
+        key = self.key_of(estimate)
+        if key is None:
+            return None
+        trajectory = self.found.trajectory
+        if self.found.by == "stamp":
+            index = nearest_stamp(trajectory.keys, int(key), self.found.bound_ns)
+        else:
+            index = self._index.get(key)
+        return None if index is None else trajectory.poses[index]
+
+    def key_of(self, estimate: PoseInterval) -> Key | None:
+        """Return what a pose must have in common with an estimate's frame; None if it is unknown.
+
+        This is the stamp in nanoseconds, the name, or the number: that which is the file's name, as
+        in KITTI, or else the place in the source, from 0.
+        """
+        if self.found.by == "stamp":
+            return estimate.stamp_ns
+        name = frame_name(estimate.source)
+        if self.found.by == "name":
+            return name
+        return int(name) if name.isdecimal() and len(name) < _LONGEST else estimate.seq
+
+    @property
+    def skipped(self) -> Skipped:
+        """What the file holds without giving a pose."""
+        return self.found.trajectory.skipped
+
+    def spans(self, first: Key | None, last: Key | None) -> str:
+        """Return the keys of frames, given the first and the last one, beside those of the poses.
+
+        None means that the frames have no keys.
+        """
+        keys = self.found.trajectory.keys
+        poses = f"poses {self._span(keys[0], keys[-1])}"
+        if first is None or last is None:
+            return f"frames without a stamp, {poses}; --stamps or --fps stamps frames"
+        return f"frames {self._span(first, last)}, {poses}"
+
+    def _span(self, first: Key, last: Key) -> str:
+        if self.found.by == "stamp":
+            return f"at {int(first) / 1e9:.3f} .. {int(last) / 1e9:.3f} s"
+        return f"{first} .. {last}"
+
+    @cached_property
+    def _index(self) -> dict[Key, int]:
+        return {key: index for index, key in enumerate(self.found.trajectory.keys)}
+
+
+def open_ground_truth(path: Path, source: str | os.PathLike[str] = "") -> GroundTruth:
+    """Read true poses in any format of ``cvo_edge.ground_truth.detect``.
+
+    Parameters
+    ----------
+    path
+        File or folder.
+    source
+        Folder, glob or file of the frames, whose place in the recordings of KITTI and EuRoC says
+        which camera's poses are wanted.
+
+    Raises SourceError if the format is unknown, a file is malformed, what leads to the camera is
+    missing, or no pose is valid.
+    """
+    given = Path(source)
+    folder = os.path.isdir(source)  # noqa: PTH112 - also of a name too long
+    return GroundTruth(find_trajectory(path, given if folder else given.parent))

@@ -1,0 +1,127 @@
+"""Stamps of image files: from their names, or from a list.
+
+===================================  ====================================  ====================
+given                                stamps                                belong to
+===================================  ====================================  ====================
+``names``                            the number at the end of each name    the file
+lines ``timestamp file`` (rgb.txt)   seconds                               files of that name
+lines ``timestamp,file`` (data.csv)  integer nanoseconds                   files of that name
+one number a line (times.txt)        seconds                               line i: frame i
+===================================  ====================================  ====================
+
+A number with a point is seconds. Integers since 1970 have 10 digits in seconds, 13 in milliseconds,
+16 in microseconds and 19 in nanoseconds; others are not taken as stamps.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+
+from cvo_edge.errors import SourceError
+from cvo_edge.trajectories.tables import first_line, read_rows, read_text, seconds_to_ns
+
+NAMES = "names"
+
+_AT_END = re.compile(r"(?:^|[^0-9.])([0-9]+(?:\.[0-9]+)?)$")
+_UNITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
+# A number with fewer digits before the point may be anything, unless stamps were asked for.
+_CERTAIN, _MOST = 9, 11
+_FORM = "stamps: timestamp file, timestamp,file or a time a line"
+
+
+def stamps_in_names(names: Sequence[str]) -> list[int] | None:
+    """Return the stamps (ns) that names without suffix end with, or None.
+
+    None unless all names have a stamp since 1970 and each is later than the one before.
+    """
+    stamps = [_stamp(name, _CERTAIN) for name in names]
+    known = [stamp for stamp in stamps if stamp is not None]
+    rising = all(first < second for first, second in pairwise(known))
+    return known if len(known) == len(stamps) and rising else None
+
+
+def read_stamps(given: str, names: Sequence[str], files: Sequence[str]) -> list[int]:
+    """Return the stamps (ns) of image files.
+
+    Parameters
+    ----------
+    given
+        ``names``, or the path of a list.
+    names, files
+        Each image's name without suffix and mark, and with them.
+
+    Raises
+    ------
+    SourceError
+        An image has no stamp, or one that is not later than the one before.
+    """
+    if given == NAMES:
+        stamps = [_needed(_stamp(name, 1), file) for name, file in zip(names, files, strict=True)]
+    else:
+        stamps = _listed(Path(given), names, files)
+    for place, (first, second) in enumerate(pairwise(stamps)):
+        if second <= first:
+            raise SourceError(
+                f"stamps: expected each later than the one before, found {_seconds(first)} for "
+                f"{files[place]} and {_seconds(second)} for {files[place + 1]}"
+            )
+    return stamps
+
+
+def _listed(path: Path, names: Sequence[str], files: Sequence[str]) -> list[int]:
+    _, line = first_line(read_text(path, _FORM))
+    if "," in line:
+        rows = read_rows(path, "timestamp,file", separator=",", more=True)
+        return _by_name(path, [(row.nanoseconds(), row.fields[1]) for row in rows], files)
+    if len(line.split()) > 1:
+        rows = read_rows(path, "timestamp file", more=True)
+        return _by_name(path, [(row.seconds(), row.fields[1]) for row in rows], files)
+    if not line:
+        raise SourceError(f"{path}: expected {_FORM}, found no line")
+    times = [row.seconds() for row in read_rows(path, "time")]
+    numbered = all(name.isdecimal() for name in names)
+    places = [int(name) for name in names] if numbered else list(range(len(names)))
+    if max(places) >= len(times) or (not numbered and len(places) != len(times)):
+        raise SourceError(
+            f"{path}: expected a time for each of {len(names)} frames"
+            f"{f', numbers to {max(places)}' if numbered else ''}, found {len(times)}"
+        )
+    return [times[place] for place in places]
+
+
+def _by_name(path: Path, listed: Sequence[tuple[int, str]], files: Sequence[str]) -> list[int]:
+    stamps: dict[str, int] = {}
+    for stamp, file in listed:
+        stamps.setdefault(PurePosixPath(file).name, stamp)
+    for file in files:
+        if file not in stamps:
+            raise SourceError(f"{path}: expected a stamp for {file}, found none")
+    return [stamps[file] for file in files]
+
+
+def _stamp(name: str, digits: int) -> int | None:
+    """Return the stamp at the end of a name; seconds have at least ``digits`` before the point."""
+    found = _AT_END.search(name)
+    if found is None:
+        return None
+    whole, point, _ = found[1].partition(".")
+    if point:
+        return seconds_to_ns(found[1]) if digits <= len(whole) <= _MOST else None
+    unit = _UNITS.get(len(whole))
+    return int(whole) * unit if unit else None
+
+
+def _needed(stamp: int | None, file: str) -> int:
+    if stamp is None:
+        raise SourceError(
+            f"stamps: expected names that end in seconds with a point, or in an integer of "
+            f"{', '.join(map(str, _UNITS))} digits (s, ms, us, ns), found {file}"
+        )
+    return stamp
+
+
+def _seconds(stamp_ns: int) -> str:
+    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d} s"
