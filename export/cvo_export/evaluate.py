@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
@@ -24,6 +24,7 @@ from cvo_export.bundles.observed import observe
 from cvo_export.bundles.online import Schedule, Stage, online, online_lines
 from cvo_export.bundles.rule import chosen_rule
 from cvo_export.bundles.thresholds import with_thresholds
+from cvo_export.data.errors import MedianError, mean_pose_error
 from cvo_export.data.noise import Noise, noisy
 from cvo_export.data.splits import Split, same_split
 from cvo_export.datasets import PoseDataset
@@ -35,6 +36,8 @@ Array = NDArray[np.float64]
 # Footnotes for coverage bands that are not exact.
 _INDICATIVE = "? indicative: frames of one recording are not independent draws"
 _NO_CLAIM = "- no band: thresholds from clean frames guarantee nothing for noisy frames"
+# Error as a share of the mean pose's from which a network has learned next to nothing.
+_HARDLY_BETTER = 0.9
 _CROSSED = (
     "recalibrated: not for a crossed calibration, whose network was trained on its calibration "
     "frames"
@@ -122,6 +125,7 @@ def evaluate(
             "named_as_training_data": dataset.name == calibration.provenance.dataset,
             "still": list(calibration.pose.still),
             "point_error": point_error(seen),
+            "mean_pose_error": mean_pose_error(seen.true_pose)._asdict(),
             "own": sets.own(),
             "levels": levels,
             "sequences": sets.sequences(dataset),
@@ -192,6 +196,7 @@ def table(report: Mapping[str, Any]) -> list[str]:
         f"point error  median {100 * error['median_m']:.2f} cm {error['median_deg']:.2f} deg, "
         f"90 % {100 * error['p90_m']:.2f} cm {error['p90_deg']:.2f} deg, "
         f"99 % {100 * error['p99_m']:.2f} cm {error['p99_deg']:.2f} deg",
+        *_mean_pose_lines(error, MedianError(**report["mean_pose_error"]), report["still"]),
     ]
     if report["still"]:
         lines.append(still_text(report["still"]))
@@ -234,6 +239,28 @@ def table(report: Mapping[str, Any]) -> list[str]:
         *_level_lines(report, report["rule"], again["levels"]),
         *_sequence_lines(again["sequences"]),
     ]
+
+
+def _mean_pose_lines(
+    error: Mapping[str, float], mean: MedianError, still: Collection[str]
+) -> list[str]:
+    """Return the error of one pose for all frames; say if the network is hardly better."""
+    shares = MedianError(error["median_m"], error["median_deg"]).shares(mean)
+    names = get_args(StillDof)
+    parts = zip(("position", "rotation"), shares, (names[:3], names[3:]), strict=True)
+    kinds = [
+        kind for kind, share, dof in parts if share > _HARDLY_BETTER and not set(dof) <= set(still)
+    ]
+    lines = [
+        f"mean pose    median {100 * mean.position_m:.2f} cm {mean.rotation_deg:.2f} deg: one pose "
+        "for all these frames"
+    ]
+    if kinds:
+        lines.append(
+            f"warning: in {' and '.join(kinds)} the network is hardly better than that; it has not "
+            "learned the place from so few or such different frames"
+        )
+    return lines
 
 
 def _bounded(levels: list[dict[str, Any]], frames: int) -> int:

@@ -52,6 +52,24 @@ def test_report_has_the_documented_keys(report):
     json.dumps(report, allow_nan=False)
 
 
+@pytest.mark.parametrize(
+    ("share", "still", "said"),
+    [
+        (0.5, [], None),
+        (1.0, [], "position and rotation"),
+        (1.0, ["rx", "ry", "rz"], "position"),
+        (1.0, ["rx"], "position and rotation"),
+    ],
+)
+def test_a_network_that_hardly_beats_one_pose_is_called_that(report, share, still, said):
+    error = report["point_error"]
+    mean = {"position_m": error["median_m"] / share, "rotation_deg": error["median_deg"] / share}
+    text = "\n".join(table({**report, "mean_pose_error": mean, "still": still}))
+    assert f"mean pose    median {100 * mean['position_m']:.2f} cm" in text
+    warning = None if said is None else f"warning: in {said} the network is hardly better"
+    assert warning in text if warning else "hardly better" not in text
+
+
 def test_coverage_and_width_are_those_of_the_odometer(report, tiny_bundle, tiny_run):
     level = find_level(report["levels"], 0.9, "marginal")
     covered, widths = [], []
