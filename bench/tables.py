@@ -21,6 +21,7 @@ import accuracy_tables
 import comparison_tables
 import localiser_tables
 import promised_table
+import reconstruct_tables
 import speed_tables
 import study_tables
 import vigilance_tables
@@ -50,6 +51,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **speed_tables.TABLES,
     **vigilance_tables.TABLES,
     **promised_table.TABLES,
+    **reconstruct_tables.TABLES,
     "faults": faults,
     "goals": goals_table,
     "results": results_index,
