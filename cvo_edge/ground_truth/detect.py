@@ -98,7 +98,8 @@ def _file_in(folder: Path) -> Path | None:
 def _read_file(path: Path, frames: Path) -> Found:
     if path.suffix in _BAGS:
         raise _bag(path)
-    if path.suffix == ".bin":
+    # The lines of keypoints make this file longer than those of other formats may be.
+    if path.suffix == ".bin" or path.name == "images.txt":
         return Found(_colmap(path, frames), "name")
     number, line = first_line(read_text(path, FORMATS))
     if line.startswith("{"):

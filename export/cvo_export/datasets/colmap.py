@@ -1,49 +1,41 @@
 """COLMAP sparse models (Schoenberger and Frahm 2016): text or binary, with the images beside them.
 
-``cameras``, ``images`` and ``points3D`` are files ``.bin`` or ``.txt``; the points are not read.
-Poses are read as ``cvo_edge.trajectories.colmap`` describes.
-COLMAP gives the centre of the first pixel the coordinates (0.5, 0.5), this project (0, 0).
+``PATH[,camera=NUMBER]``. ``cameras``, ``images`` and ``points3D`` are files ``.bin`` or ``.txt``;
+the points are not read. Poses are read as ``cvo_edge.trajectories.colmap`` describes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cvo_edge.camera import Camera, Distortion
+from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
 from cvo_edge.input.image_files import natural_key
-from cvo_edge.trajectories.colmap import Bytes, model_folder, read_images, refusal
-from cvo_edge.trajectories.tables import read_text
+from cvo_edge.trajectories.colmap import Image, model_folder, read_images
+from cvo_export.datasets.alike import MOST_SPREAD, alike
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
-from cvo_export.datasets.folders import only_camera
+from cvo_export.datasets.colmap_cameras import Stated, read_cameras
+from cvo_export.datasets.folders import path_options
 from cvo_export.datasets.frames import FrameList
 
-Array = NDArray[np.float64]
+# Cameras, numbers and folders that a message names; the others are counted.
+_NAMED, _FEW = 8, 3
 
-# COLMAP's models by number: name, parameters, distortion here. The first parameters are one or two
-# focal lengths and the principal point.
-_RADIAL: Distortion = "radial_tangential"
-_MODELS: tuple[tuple[str, int, Distortion | None], ...] = (
-    ("SIMPLE_PINHOLE", 3, "none"),
-    ("PINHOLE", 4, "none"),
-    ("SIMPLE_RADIAL", 4, _RADIAL),
-    ("RADIAL", 5, _RADIAL),
-    ("OPENCV", 8, _RADIAL),
-    ("OPENCV_FISHEYE", 8, "equidistant"),
-    ("FULL_OPENCV", 12, _RADIAL),
-    ("FOV", 5, None),
-    ("SIMPLE_RADIAL_FISHEYE", 4, "equidistant"),
-    ("RADIAL_FISHEYE", 5, "equidistant"),
-    ("THIN_PRISM_FISHEYE", 12, None),
-)
-# These have two focal lengths.
-_TWO_FOCALS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
-_CAMERA_FORM = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
+
+class _Group(NamedTuple):
+    """Nearly equal cameras: their numbers, what a message says of them, and what they count as.
+
+    ``camera`` is None if the model has no counterpart here; ``merged`` is empty for one camera.
+    """
+
+    numbers: list[int]
+    text: str
+    camera: Camera | None
+    merged: str
 
 
 def open_colmap(path: str) -> PoseDataset:
@@ -51,34 +43,48 @@ def open_colmap(path: str) -> PoseDataset:
 
     Images lie in ``images``, in the project or beside the model. Images in several folders are one
     sequence a folder. Frames with an invalid pose or a missing image are left out and counted.
+    Cameras of one model and size that differ by at most 1 % count as one, their median; ``chosen``
+    says so. Of others, ``,camera=NUMBER`` chooses one, with those that are nearly equal to it; the
+    images of the rest are left out and counted.
 
-    Raises SourceError if there is no model, a file is malformed or names an image elsewhere, the
-    images have several cameras or a camera model without a counterpart here, or no frame has a
-    pose.
+    Raises UsageError for another option, and SourceError if there is no model, a file is malformed
+    or names an image elsewhere, the images have several cameras and none is chosen, or one without
+    a counterpart here, or no frame has a pose.
     """
-    root = Path(path)
+    place, options = path_options("colmap", path, ("camera",))
+    root = Path(place)
     folder = _model_folder(root)
-    binary = (folder / "images.bin").is_file()
-    cameras = dict(_binary_cameras(folder) if binary else _text_cameras(folder))
-    found = read_images(folder / f"images.{'bin' if binary else 'txt'}")
+    suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
+    cameras = read_cameras(folder / f"cameras{suffix}")
+    found = sorted(
+        read_images(folder / f"images{suffix}"), key=lambda image: natural_key(Path(image.name))
+    )
     images = _image_folder(root, folder)
-    frames = FrameList(root)
-    name = root.resolve().name
-    for image in sorted(found, key=lambda image: natural_key(Path(image.name))):
-        place = PurePosixPath(image.name)
-        if place.is_absolute() or ".." in place.parts:
+    for image in found:
+        name = PurePosixPath(image.name)
+        if name.is_absolute() or ".." in name.parts:
             raise SourceError(
                 f"{folder}: expected names of images below {images}, found {image.name!r}"
             )
-        sequence = str(place.parent) if place.parent.name else name
-        frames.add(sequence, place.stem, images / image.name, image.pose)
-    used = {image.camera for image in found}
-    if missing := used - cameras.keys():
+    if missing := {image.camera for image in found} - cameras.keys():
         raise SourceError(f"{folder}: expected a camera {min(missing)} of an image, found none")
-    dataset = frames.dataset(name)
-    camera = only_camera(folder, {f"camera {number}": cameras[number] for number in sorted(used)})
-    if camera is None:
-        return dataset
+    present = [image for image in found if image.pose is not None]
+    if len({image.camera for image in present}) > 1:
+        present = [image for image in present if (images / image.name).is_file()]
+    groups = _groups(cameras, present or found)
+    group = _choose(folder, place, groups, options.get("camera"))
+    others = {number for each in groups if each is not group for number in each.numbers}
+    frames = FrameList(root)
+    for image in found:
+        name = PurePosixPath(image.name)
+        if image.camera in others:
+            frames.skip("of another camera")
+            continue
+        sequence = str(name.parent) if name.parent.name else root.resolve().name
+        where = f"{image.where}: {image.fault}" if image.fault else ""
+        frames.add(sequence, name.stem, images / image.name, image.pose, where=where)
+    dataset = frames.dataset(root.resolve().name)
+    camera = group.camera or cameras[group.numbers[0]].camera()
     height, width = dataset.read_image(0).shape[:2]
     if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
         raise SourceError(
@@ -90,6 +96,7 @@ def open_colmap(path: str) -> PoseDataset:
         dataset,
         intrinsics=Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy),
         lens=Lens(camera.distortion, camera.coefficients),
+        chosen="; ".join(filter(None, [group.text if others else "", group.merged])),
     )
 
 
@@ -112,60 +119,71 @@ def _image_folder(root: Path, folder: Path) -> Path:
     raise SourceError(f"{root}: expected the images in a folder images, found no {tried[0]}")
 
 
-def camera_of(where: str, model: str, size: tuple[int, int], values: list[float]) -> Camera:
-    """Return the camera of COLMAP's model name, image width and height, and parameters.
+def _groups(cameras: Mapping[int, Stated], images: Sequence[Image]) -> list[_Group]:
+    """Return the cameras of the images in groups of nearly equal ones, the most images first."""
+    counts = Counter(image.camera for image in images)
+    folders: dict[int, dict[str, None]] = {}
+    for image in images:
+        folders.setdefault(image.camera, {})[str(PurePosixPath(image.name).parent)] = None
+    kinds: dict[tuple[str, tuple[int, int]], list[int]] = {}
+    for number in sorted(counts):
+        kinds.setdefault((cameras[number].model, cameras[number].size), []).append(number)
+    found = []
+    for (model, (width, height)), numbers in kinds.items():
+        each: list[tuple[Camera | None, list[int]]] = [(None, numbers)]
+        read: dict[int, Camera] = {}
+        if cameras[numbers[0]].usable:
+            read = {number: cameras[number].camera() for number in numbers}
+            each = [
+                (camera, [numbers[index] for index in own])
+                for camera, own in alike(list(read.values()), [counts[key] for key in numbers])
+            ]
+        for camera, own in each:
+            count = sum(counts[number] for number in own)
+            places = list(dict.fromkeys(place for number in own for place in folders[number]))
+            text = (
+                f"{_listed('camera', own)} ({model} {width}x{height}, {count} "
+                f"image{'' if count == 1 else 's'} in {_listed('folder', places)})"
+            )
+            merged = _merged([read[number] for number in own]) if camera else ""
+            found.append((count, _Group(own, text, camera, merged)))
+    return [group for _, group in sorted(found, key=lambda entry: -entry[0])]
 
-    Raises SourceError, which begins with ``where``, if there is no such camera here.
-    """
-    known = {name: (count, distortion) for name, count, distortion in _MODELS}
-    count, distortion = known.get(model, (0, None))
-    if distortion is None:
-        usable = ", ".join(name for name, (_, lens) in known.items() if lens)
-        raise SourceError(
-            f"{where}: expected a camera model {usable}, found {model}; undistort the images with "
-            "`colmap image_undistorter`"
-        )
-    if len(values) != count:
-        raise SourceError(f"{where}: expected {count} parameters of {model}, found {len(values)}")
-    focal = 2 if model in _TWO_FOCALS else 1
-    fx, fy, (cx, cy) = values[0], values[focal - 1], values[focal : focal + 2]
-    intrinsics = Intrinsics(fx, fy, cx - 0.5, cy - 0.5)
-    if not (intrinsics.possible and np.isfinite(values).all() and min(size) > 0):
-        raise SourceError(f"{where}: expected positive focal lengths and sizes, found {values}")
-    lens = values[focal + 2 :]
-    if distortion != "none":
-        lens = [*lens, *[0.0] * (4 - len(lens))]
-    return Camera(
-        width=size[0],
-        height=size[1],
-        **intrinsics._asdict(),
-        distortion=distortion,
-        coefficients=tuple(lens),
+
+def _listed(what: str, items: Sequence[object]) -> str:
+    """Return the first few of the items: ``cameras 1, 4, 7 and 295 more``."""
+    more = f" and {len(items) - _FEW} more" if len(items) > _FEW else ""
+    named = ", ".join(str(item) for item in items[:_FEW])
+    return f"{what}{'' if len(items) == 1 else 's'} {named}{more}"
+
+
+def _merged(cameras: Sequence[Camera]) -> str:
+    """Say how several cameras count as one; return nothing for a single one."""
+    if len(set(cameras)) == 1:
+        return f"{len(cameras)} equal cameras count as one" if len(cameras) > 1 else ""
+    focal_px = [camera.focal_px for camera in cameras]
+    return (
+        f"{len(cameras)} cameras count as one, the median of focal lengths "
+        f"{min(focal_px):.1f} to {max(focal_px):.1f} px"
     )
 
 
-def _text_cameras(folder: Path) -> Iterator[tuple[int, Camera]]:
-    path = folder / "cameras.txt"
-    for number, line in enumerate(read_text(path, _CAMERA_FORM).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        try:
-            identity, model, width, height, *values = line.split()
-            size, numbers = (int(width), int(height)), [float(value) for value in values]
-            key = int(identity)
-        except ValueError:
-            raise refusal(path, _CAMERA_FORM, line, number) from None
-        yield key, camera_of(f"{path}: line {number}", model, size, numbers)
-
-
-def _binary_cameras(folder: Path) -> Iterator[tuple[int, Camera]]:
-    path = folder / "cameras.bin"
-    content = Bytes(path)
-    (count,) = content.take("Q")
-    for _ in range(count):
-        identity, model, width, height = content.take("iiQQ")
-        if not 0 <= model < len(_MODELS):
-            raise content.refusal(f"a camera model 0 to {len(_MODELS) - 1}, not {model}")
-        name, parameters, _ = _MODELS[model]
-        values = list(content.take(f"{parameters}d"))
-        yield identity, camera_of(f"{path}: camera {identity}", name, (width, height), values)
+def _choose(folder: Path, place: str, groups: Sequence[_Group], wanted: str | None) -> _Group:
+    """Return the only group, or that with the camera ``wanted``; raises SourceError."""
+    if not groups:
+        raise SourceError(f"{folder}: expected images with a pose, found no image")
+    texts = [group.text for group in groups[:_NAMED]]
+    more = [f"{len(groups) - _NAMED} more"] if len(groups) > _NAMED else []
+    listed = ", ".join([*texts, *more])
+    if wanted is not None:
+        for group in groups:
+            if wanted in map(str, group.numbers):
+                return group
+        raise SourceError(f"{folder}: expected camera= to name one of {listed}, found {wanted!r}")
+    if len(groups) > 1:
+        raise SourceError(
+            f"{folder}: expected images of one camera, within {MOST_SPREAD:.0%}, found {listed}; "
+            f"choose one, e.g. colmap:{place},camera={groups[0].numbers[0]}, which leaves the "
+            "images of the others out"
+        )
+    return groups[0]

@@ -1,12 +1,12 @@
-"""Find the recordings under a path."""
+"""Find the recordings under a path, and divide it from its options."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from cvo_edge.errors import SourceError
+from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.input.image_files import natural_key
 
 Camera = TypeVar("Camera")
@@ -25,6 +25,26 @@ def recordings(root: Path, marker: str) -> dict[str, Path]:
     if not found:
         raise SourceError(f"{root}: expected {marker}, or folders that contain it, found neither")
     return found
+
+
+def path_options(kind: str, text: str, known: Sequence[str]) -> tuple[str, dict[str, str]]:
+    """Divide ``PATH,option=value...``; an existing path is one as a whole, with its commas.
+
+    Raises UsageError, which begins with ``kind``, for unknown and repeated options.
+    """
+    if Path(text).exists():
+        return text, {}
+    place, *items = text.split(",")
+    options: dict[str, str] = {}
+    for item in items:
+        name, _, value = item.partition("=")
+        if name not in known or not value or name in options:
+            raise UsageError(
+                f"{kind}: expected PATH and any of {', '.join(f'{each}=' for each in known)} "
+                f"once, found {item!r}"
+            )
+        options[name] = value
+    return place, options
 
 
 def only_world(root: Path, folders: list[Path], kind: str) -> Path:

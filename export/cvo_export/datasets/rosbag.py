@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.errors import SourceError
 from cvo_edge.pose import Pose
 from cvo_edge.trajectories.poses import matrix_to_pose, read_pose_matrix
 from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS
@@ -40,7 +40,7 @@ from cvo_export.datasets.bag_poses import (
     read_poses,
 )
 from cvo_export.datasets.base import PoseDataset, skipped_text
-from cvo_export.datasets.folders import only_camera
+from cvo_export.datasets.folders import only_camera, path_options
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -78,7 +78,7 @@ def open_rosbag(path: str) -> PoseDataset:
     Raises UsageError for unknown options and SourceError if a bag is damaged, a topic is missing or
     ambiguous, bags have different cameras or worlds, or no frame has a pose.
     """
-    place, options = _parsed(path)
+    place, options = path_options("rosbag", path, _OPTIONS)
     root = Path(place)
     images: list[_Image] = []
     poses: list[Array] = []
@@ -135,21 +135,6 @@ def open_rosbag(path: str) -> PoseDataset:
     )
     camera = only_camera(root, cameras)
     return dataset if camera is None else replace(dataset, intrinsics=camera[0], lens=camera[1])
-
-
-def _parsed(text: str) -> tuple[str, dict[str, str]]:
-    """Divide ``PATH,option=value...``; raises UsageError for unknown and repeated options."""
-    place, *items = text.split(",")
-    options: dict[str, str] = {}
-    for item in items:
-        name, _, value = item.partition("=")
-        if name not in _OPTIONS or not value or name in options:
-            raise UsageError(
-                f"rosbag: expected PATH and any of {', '.join(f'{each}=' for each in _OPTIONS)} "
-                f"once, found {item!r}"
-            )
-        options[name] = value
-    return place, options
 
 
 def _index(bag: Bag, topic: str, skipped: Counter[str]) -> tuple[list[_Image], Stamps, str]:

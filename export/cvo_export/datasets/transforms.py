@@ -18,7 +18,7 @@ from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
 from cvo_edge.trajectories.transforms import FILE, frame_poses, read_document
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
-from cvo_export.datasets.colmap import camera_of
+from cvo_export.datasets.colmap_cameras import camera_of
 from cvo_export.datasets.folders import only_camera
 from cvo_export.datasets.frames import FrameList
 
