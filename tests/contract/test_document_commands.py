@@ -1,8 +1,9 @@
 """Every command and every Python example in the documents runs.
 
 An HTML comment before a fenced block gives its class: ``<!-- test: run -->`` (run with the
-demonstration bundle and clip), ``<!-- test: train -->`` (run on a tiny rendered data set) or
-``<!-- test: parse -->`` (only programs, commands and options are checked).
+demonstration bundle and clip), ``<!-- test: train -->`` (run on a tiny rendered data set),
+``<!-- test: tutorial -->`` (run on a small rendered video) or ``<!-- test: parse -->`` (only
+programs, commands and options are checked).
 """
 
 import re
@@ -14,11 +15,13 @@ from functools import cache
 from itertools import takewhile
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 import typer
 from typer.main import get_command
 
+from cvo_edge.output.records import read_records
 from cvo_edge.programs.cli import app as edge_app
 from cvo_export.cli import app as export_app
 from cvo_export.datasets import open_dataset
@@ -30,7 +33,7 @@ PAGES = sorted(
     for pattern in ("*.md", "docs/**/*.md", "*/README.md", "bench/results/README.md")
     for path in ROOT.glob(pattern)
 )
-SHELLS, CLASSES = ("sh", "console", "bash", "shell"), ("run", "train", "parse")
+SHELLS, CLASSES = ("sh", "console", "bash", "shell"), ("run", "train", "tutorial", "parse")
 COMMANDS = {"cvo-edge": get_command(edge_app), "cvo-export": get_command(export_app)}
 OTHERS = ("openssl", "ray", "git")
 # Options that reduce a command's work; the last occurrence of an option counts.
@@ -40,6 +43,12 @@ SMALL = {
     ("cvo-export", "train"): [
         *("--weights", "none", "--size", "64x48", "--copies", "0", "--steps", "100")
     ],
+}
+# The video of the tutorial has few frames, all of which are used.
+SHORT = {
+    **SMALL,
+    ("cvo-export", "reconstruct"): ["--step", "0.001", "--tag-size", "0.3"],
+    ("cvo-export", "train"): [*SMALL["cvo-export", "train"], "--split", "random"],
 }
 SCENE = "synthetic:room,flights=8,frames=12,size=64x48"
 
@@ -126,7 +135,13 @@ def check_extras(wanted: str) -> None:
     assert asked <= set(project["optional-dependencies"]), wanted
 
 
-def execute(page: str, kind: str, monkeypatch: pytest.MonkeyPatch, done: list[list[str]]) -> None:
+def execute(
+    page: str,
+    kind: str,
+    monkeypatch: pytest.MonkeyPatch,
+    done: list[list[str]],
+    small: dict[tuple[str, str], list[str]] = SMALL,
+) -> None:
     """Run a page's blocks of one class in order; skip commands that are in ``done``."""
     for block in blocks(page):
         if block.kind != kind:
@@ -140,16 +155,16 @@ def execute(page: str, kind: str, monkeypatch: pytest.MonkeyPatch, done: list[li
                 monkeypatch.setenv(name, value)
             parse(command)
             if command[0] in COMMANDS and words not in done:
-                run_own(command)
+                run_own(command, small)
                 done.append(words)
 
 
-def run_own(words: list[str]) -> None:
+def run_own(words: list[str], small: dict[tuple[str, str], list[str]]) -> None:
     program, name, *rest = words
     if (name, rest[:1]) == ("train", ["scr"]):
         # It takes minutes until SCR knows a place well enough to be published.
         rest[0] = "cjp"
-    arguments = [name, *rest, *SMALL.get((program, name), [])]
+    arguments = [name, *rest, *small.get((program, name), [])]
     try:
         with COMMANDS[program].make_context(program, arguments) as context:
             COMMANDS[program].invoke(context)
@@ -201,6 +216,18 @@ def furnish(folder: Path, artifacts: Path) -> None:
         shutil.copy(frame, folder / "frames")
 
 
+def film(path: Path, flight: int, frames: int) -> None:
+    """Write every sixth frame of a flight before a wall with a large tag."""
+    step = 6
+    spec = f"synthetic:room,flights={flight + 1},frames={step * frames},size=200x150,tag=0.3"
+    flights = open_dataset(spec)
+    codec = cv2.VideoWriter_fourcc(*"mp4v")
+    video = cv2.VideoWriter(str(path), codec, 30.0, (200, 150))
+    for frame in range(frames):
+        video.write(flights.read_image(step * (flight * frames + frame)))
+    video.release()
+
+
 def test_every_block_of_commands_says_how_it_is_tested() -> None:
     for page in PAGES:
         for block in blocks(page):
@@ -238,3 +265,14 @@ def test_what_needs_no_training_runs(page, stage, monkeypatch, capfd) -> None:
 def test_what_trains_runs_on_a_small_scene(page, workshop, monkeypatch, capfd) -> None:
     monkeypatch.chdir(workshop.folder)
     execute(page, "train", monkeypatch, workshop.done)
+
+
+def test_the_tutorial_leads_from_a_video_to_intervals(tmp_path, monkeypatch, capfd) -> None:
+    pytest.importorskip("pycolmap")
+    torch.set_num_threads(1)
+    monkeypatch.chdir(tmp_path)
+    film(tmp_path / "desk.mp4", flight=0, frames=90)
+    film(tmp_path / "live.mp4", flight=1, frames=12)
+    execute("docs/tutorial.md", "tutorial", monkeypatch, [], SHORT)
+    records = list(read_records(tmp_path / "records.jsonl"))
+    assert any(record.interval and record.interval.bounded for record in records)
