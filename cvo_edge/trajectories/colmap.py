@@ -130,7 +130,7 @@ def _is_image(fields: list[bytes]) -> bool:
 
 def refusal(path: Path, form: str, line: str, number: int) -> SourceError:
     """Return an error that states what was expected in a line."""
-    return SourceError(f"{path}: expected {form}, found {line[:80]!r} in line {number}")
+    return SourceError(f"{path}: expected {form}, found {line.strip()[:80]!r} in line {number}")
 
 
 class Bytes:

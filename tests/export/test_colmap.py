@@ -266,7 +266,7 @@ IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"
 @pytest.mark.parametrize(
     ("file", "content", "expected"),
     [
-        ("images.txt", IMAGE * 2, f"a line of keypoints.*, found '{IMAGE[:-1]}.*' in line 2"),
+        ("images.txt", IMAGE * 2, f"a line of keypoints.*, found '{IMAGE[:-1]}' in line 2"),
         ("images.txt", IMAGE.replace("a.png", "a" * 9000), "of less than 8192 bytes, .* in line 1"),
         ("images.txt", b"1 1 0 0 0 0 0 0 1 \xff.png\n", "IMAGE_ID .* in line 1"),
         ("images.bin", struct.pack("<Q", 1 << 40), "at most 0 images, not 1099511627776, .*byte 8"),
