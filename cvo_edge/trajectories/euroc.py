@@ -50,12 +50,13 @@ def read_euroc(path: Path, T_body_camera: NDArray[np.float64]) -> Trajectory[int
 
 def read_body_camera(path: Path) -> NDArray[np.float64]:
     """Read ``T_body_camera`` (4, 4), metres, from a ``sensor.yaml``; raises SourceError."""
-    text = read_text(path, "a camera's T_BS")
-    found = _T_BS.search(re.sub("#.*", "", text))
+    text = read_text(path, "a camera's T_BS and intrinsics")
+    match = _T_BS.search(re.sub("#.*", "", text))
     try:
-        T = np.array(found[1].split(",") if found else [], dtype=np.float64)
+        T = np.array(match[1].split(",") if match else [], dtype=np.float64)
     except ValueError:
         T = np.empty(0)
     if T.size != 16 or matrix_to_pose(T.reshape(4, 4)) is None:
-        raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid transform, found none")
+        found = f"[{' '.join(match[1].split())}]"[:80] if match else "none"
+        raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid transform, found {found}")
     return T.reshape(4, 4)

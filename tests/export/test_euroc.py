@@ -179,7 +179,7 @@ def test_recordings_of_one_room_are_one_data_set(tmp_path):
         ("date: 2014-13-45", "YAML with T_BS and intrinsics, found other text"),
         ("[" * 3000, "YAML with T_BS and intrinsics, found other text"),
         (f"T_BS: [{', '.join('1' * 99)}]", f"T_BS, 16 numbers of a rigid transform, found {ONES}"),
-        ("a: 1", "T_BS, 16 numbers of a rigid transform, found None"),
+        ("a: 1", "T_BS, 16 numbers of a rigid transform, found none"),
         ("T_BS: [1, 2]", "T_BS, 16 numbers of a rigid transform, found [1, 2]"),
         (
             "T_BS: {data: [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}",

@@ -15,17 +15,17 @@ from cvo_edge.camera import Camera
 from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.geometry import quaternion_to_matrix
 from cvo_export.datasets import open_dataset
+from cvo_export.datasets.colmap_cameras import camera_of
 from cvo_export.reconstruct import choice, pairs, recordings, scale, similarity, stages, tags
 from cvo_export.reconstruct.mapping import in_process
 from cvo_export.reconstruct.model import (
     Model,
     colmap_camera,
-    project_camera,
     read_intrinsics,
     read_model,
 )
-from cvo_export.reconstruct.report import Gap, gaps, report_lines
-from cvo_export.reconstruct.run import Options, read_report, reconstruct
+from cvo_export.reconstruct.report import Gap, Report, gaps, report_lines
+from cvo_export.reconstruct.run import Options, reconstruct
 
 RNG = np.random.default_rng(7)
 LENS = Camera(
@@ -132,9 +132,9 @@ def test_cameras_project_as_colmap_does(camera):
     """Both ways, and a ray meets COLMAP's pixel half a pixel further right and below."""
     pycolmap = pytest.importorskip("pycolmap")
     model, parameters = colmap_camera(camera)
-    size = {"width": camera.width, "height": camera.height}
-    assert project_camera(model, parameters, **size) == camera
-    theirs = pycolmap.Camera(model=model, params=parameters, **size)
+    size = (camera.width, camera.height)
+    assert camera_of("", model, size, parameters) == camera
+    theirs = pycolmap.Camera(model=model, params=parameters, width=size[0], height=size[1])
     points = np.array([[0.1, -0.2, 1.0], [-0.3, 0.1, 2.0]])
     assert np.allclose(theirs.img_from_cam(points), camera.project(points) + 0.5, atol=1e-9)
 
@@ -462,7 +462,7 @@ def test_a_rendered_walk_becomes_a_metric_map(walked):
     assert report.registered == 1.0
     assert report.unit == "metres"
     assert report.doubts == ()
-    assert read_report(scene) == report
+    assert msgspec.json.decode((scene / "report.json").read_bytes(), type=Report) == report
     assert "map: 10 of 10 images placed (100.0%)" in "\n".join(report_lines(report))
     model = read_model(scene / "sparse" / "0")
     assert model.names == tuple(recordings.image_name("walk", number) for number in range(10))

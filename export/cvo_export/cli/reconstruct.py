@@ -80,7 +80,8 @@ def reconstruct(
     says what can be trusted; it is also in SCENE/report.json.
     """
     from cvo_export.progress import show_progress
-    from cvo_export.reconstruct.run import Options, report_lines
+    from cvo_export.reconstruct.report import report_lines
+    from cvo_export.reconstruct.run import Options
     from cvo_export.reconstruct.run import reconstruct as run
 
     options = Options(

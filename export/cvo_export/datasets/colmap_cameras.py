@@ -18,6 +18,8 @@ from cvo_edge.trajectories.colmap import MAX_COUNT, Bytes, refusal
 from cvo_edge.trajectories.tables import read_text
 from cvo_export.datasets.base import Intrinsics
 
+HALF_PIXEL = 0.5
+
 # COLMAP's models by number: name, parameters, distortion here. The first parameters are one or two
 # focal lengths and the principal point.
 _RADIAL: Distortion = "radial_tangential"
@@ -100,7 +102,7 @@ def camera_of(where: str, model: str, size: tuple[int, int], values: list[float]
         raise SourceError(f"{where}: expected {count} parameters of {model}, found {len(values)}")
     focal = 2 if model in _TWO_FOCALS else 1
     fx, fy, (cx, cy) = values[0], values[focal - 1], values[focal : focal + 2]
-    intrinsics = Intrinsics(fx, fy, cx - 0.5, cy - 0.5)
+    intrinsics = Intrinsics(fx, fy, cx - HALF_PIXEL, cy - HALF_PIXEL)
     if not (intrinsics.possible and np.isfinite(values).all() and min(size) > 0):
         raise SourceError(f"{where}: expected positive focal lengths and sizes, found {values}")
     lens = values[focal + 2 :]

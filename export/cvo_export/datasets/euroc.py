@@ -16,12 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.trajectories.euroc import MAX_STAMP_DIFFERENCE_NS, read_euroc
+from cvo_edge.trajectories.euroc import (
+    MAX_STAMP_DIFFERENCE_NS,
+    read_body_camera,
+    read_euroc,
+)
 from cvo_edge.trajectories.tables import read_rows
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.sensors import pinhole, read_document, rigid_transform
+from cvo_export.datasets.sensors import pinhole, read_document
 from cvo_export.datasets.stamps import add_associated
 
 Array = NDArray[np.float64]
@@ -74,8 +78,4 @@ def _add_recording(frames: FrameList, name: str, folder: Path, T_body_camera: Ar
 def _read_camera(path: Path) -> tuple[tuple[Intrinsics, Lens] | None, Array]:
     """Return the intrinsics with the lens, and ``T_body_camera``, shape (4, 4), metres."""
     document = read_document(path, "T_BS")
-    T_BS = document.get("T_BS")
-    T_body_camera = rigid_transform(
-        path, "T_BS", T_BS.get("data") if isinstance(T_BS, dict) else T_BS
-    )
-    return pinhole(path, document, "distortion_coefficients"), T_body_camera
+    return pinhole(path, document, "distortion_coefficients"), read_body_camera(path)

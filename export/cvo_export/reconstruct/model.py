@@ -1,7 +1,4 @@
-"""The map as arrays in the project's conventions, and cameras in COLMAP's.
-
-COLMAP puts the centre of the first pixel at (0.5, 0.5), this project at (0, 0).
-"""
+"""The map as arrays in the project's conventions, and cameras in COLMAP's."""
 
 from __future__ import annotations
 
@@ -14,12 +11,12 @@ from numpy.typing import NDArray
 from cvo_edge import geometry
 from cvo_edge.camera import Camera, checked_camera
 from cvo_edge.errors import SinkError, UsageError
+from cvo_export.datasets.colmap_cameras import HALF_PIXEL, camera_of
 from cvo_export.reconstruct.similarity import Similarity
 from cvo_export.reconstruct.stages import remove
 
 Array = NDArray[np.float64]
 
-_HALF = 0.5
 _COUNTS = (4, 8, 9, 12)
 
 
@@ -52,8 +49,8 @@ def read_intrinsics(text: str, width: int, height: int) -> Camera:
 
 
 def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
-    """Return COLMAP's model and parameters of a camera."""
-    pinhole = [camera.fx, camera.fy, camera.cx + _HALF, camera.cy + _HALF]
+    """Return COLMAP's model and parameters of a camera; inverse of ``camera_of``."""
+    pinhole = [camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL]
     if camera.distortion == "none":
         return "PINHOLE", pinhole
     if camera.distortion == "equidistant":
@@ -61,26 +58,6 @@ def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
     if len(camera.coefficients) == 4:
         return "OPENCV", [*pinhole, *camera.coefficients]
     return "FULL_OPENCV", [*pinhole, *(*camera.coefficients, 0.0, 0.0, 0.0)[:8]]
-
-
-def project_camera(model: str, parameters: list[float], width: int, height: int) -> Camera:
-    """Return the camera with COLMAP's model and parameters; inverse of ``colmap_camera``."""
-    if model == "SIMPLE_RADIAL":
-        focal, cx, cy, k1 = parameters
-        parameters = [focal, focal, cx, cy, k1, 0.0, 0.0, 0.0]
-    fx, fy, cx, cy, *lens = parameters
-    return Camera(
-        width=width,
-        height=height,
-        fx=fx,
-        fy=fy,
-        cx=cx - _HALF,
-        cy=cy - _HALF,
-        distortion={"PINHOLE": "none", "OPENCV_FISHEYE": "equidistant"}.get(  # type: ignore[arg-type]
-            model, "radial_tangential"
-        ),
-        coefficients=tuple(lens),
-    )
 
 
 class Model(NamedTuple):
@@ -116,8 +93,11 @@ def _read(folder: Path) -> Any:  # noqa: ANN401 - pycolmap is an optional packag
 def model_of(found: Any) -> Model:  # noqa: ANN401
     """Return the arrays of a ``pycolmap.Reconstruction``."""
     cameras = {
-        number: project_camera(
-            camera.model_name, list(map(float, camera.params)), camera.width, camera.height
+        number: camera_of(
+            f"camera {number}",
+            camera.model_name,
+            (camera.width, camera.height),
+            list(map(float, camera.params)),
         )
         for number, camera in found.cameras.items()
     }

@@ -14,9 +14,8 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError, UsageError
-from cvo_export.files import read_json, write_json
+from cvo_export.files import write_json
 from cvo_export.progress import Progress
 from cvo_export.reconstruct.choice import chosen, fitting_step
 from cvo_export.reconstruct.mapping import (
@@ -40,7 +39,7 @@ from cvo_export.reconstruct.recordings import (
     measure,
     write_images,
 )
-from cvo_export.reconstruct.report import Report, make_report, report_lines
+from cvo_export.reconstruct.report import Report, make_report
 from cvo_export.reconstruct.scale import (
     Scale,
     align_to_poses,
@@ -253,14 +252,10 @@ def _groups(
     return [
         Group(
             tuple(each.name for each in used if (each.width, each.height) == size),
-            _camera(intrinsics, size),
+            None if intrinsics is None else read_intrinsics(intrinsics, *size),
         )
         for size in sizes
     ]
-
-
-def _camera(intrinsics: str | None, size: tuple[int, int]) -> Camera | None:
-    return None if intrinsics is None else read_intrinsics(intrinsics, *size)
 
 
 def _check_database(layout: Layout, stages: Stages) -> None:
@@ -286,7 +281,7 @@ def _read_map(layout: Layout, stages: Stages) -> tuple[Model, Mapped]:
     """Return the finished map; raises SourceError if damaged, and the same call maps again."""
     try:
         return read_model(layout.model), read_mapped(layout)
-    except (OSError, ValueError, LookupError, RuntimeError):
+    except (OSError, ValueError, LookupError, RuntimeError, SourceError):
         stages.repeat("mapping")
         raise SourceError(_damaged(layout.model, "the map")) from None
 
@@ -327,11 +322,3 @@ def _sightings(layout: Layout, model: Model, progress: Progress) -> list[Sightin
         found += [Sighting(number, row, corners) for number, corners in find_tags(image)]
         progress("tags", row + 1, len(model.names))
     return found
-
-
-def read_report(scene: Path) -> Report:
-    """Read a scene's report; raises UsageError."""
-    return read_json(scene / "report.json", Report, "the report of a reconstruction")
-
-
-__all__ = ["Options", "choose", "read_report", "reconstruct", "report_lines"]
