@@ -74,7 +74,7 @@ def test_opening_paints_nothing():
         ("", "room", "''"),
         ("room,", "flights=", "''"),
         ("room,colour=red", "flights=", "colour=red"),
-        ("room,flights", "1..1000", "flights"),
+        ("room,flights", "flights=", "flights"),
         ("room,flights=0", "1..1000", "flights=0"),
         ("room,flights=1001", "1..1000", "flights=1001"),
         ("room,flights=-3", "1..1000", "flights=-3"),
@@ -90,11 +90,11 @@ def test_opening_paints_nothing():
         ("room,size=320x240x3", "64x48 and 1920x1080", "size=320x240x3"),
         ("room,seed=-1", "seed=0..4294967295", "seed=-1"),
         ("room,seed=4294967296", "seed=0..4294967295", "seed=4294967296"),
-        ("room,seed=1,seed=1", "seed once", "twice"),
-        ("room,size=64x48,size=64x48", "size once", "twice"),
+        ("room,seed=1,seed=1", "tag= once", "seed=1"),
+        ("room,still=z,still=z", "tag= once", "still=z"),
         ("room,drives=2", "flights=", "drives=2"),
-        ("street,flights=2", "drives=, frames=, size= or seed=", "flights=2"),
-        ("street,turn=1", "drives=, frames=, size= or seed=", "turn=1"),
+        ("street,flights=2", "drives=, frames=, size=, seed= once", "flights=2"),
+        ("street,turn=1", "drives=, frames=, size=, seed= once", "turn=1"),
         ("street,drives=1001", "drives=1..1000", "drives=1001"),
     ],
 )
@@ -295,7 +295,7 @@ def test_the_tag_has_its_edge_length_at_its_place():
     assert np.abs(pixels - corners[0].reshape(4, 2)).max() < 1.0
 
 
-@pytest.mark.parametrize("item", ["tag=", "tag=0", "tag=0.5", "tag=nan", "tag=20cm"])
+@pytest.mark.parametrize("item", ["tag=0", "tag=0.5", "tag=nan", "tag=20cm"])
 def test_a_tag_that_fits_no_wall_is_refused(item):
     with pytest.raises(UsageError, match=r"expected tag=0\.02\.\.0\.3 in metres, found"):
         open_synthetic(f"room,{item}")

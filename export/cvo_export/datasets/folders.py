@@ -35,16 +35,23 @@ def path_options(kind: str, text: str, known: Sequence[str]) -> tuple[str, dict[
     if Path(text).exists():
         return text, {}
     place, *items = text.split(",")
+    return place, read_options(f"{kind}: expected PATH and", items, known)
+
+
+def read_options(before: str, items: Sequence[str], known: Sequence[str]) -> dict[str, str]:
+    """Return the values of ``option=value`` items, by option.
+
+    Raises UsageError, which begins with ``before``, for unknown, empty and repeated options.
+    """
     options: dict[str, str] = {}
     for item in items:
         name, _, value = item.partition("=")
         if name not in known or not value or name in options:
             raise UsageError(
-                f"{kind}: expected PATH and any of {', '.join(f'{each}=' for each in known)} "
-                f"once, found {item!r}"
+                f"{before} any of {', '.join(f'{each}=' for each in known)} once, found {item!r}"
             )
         options[name] = value
-    return place, options
+    return options
 
 
 def only_world(root: Path, folders: list[Path], kind: str) -> Path:

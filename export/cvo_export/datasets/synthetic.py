@@ -9,12 +9,13 @@ centred on the pose of its frame.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cvo_edge.errors import UsageError
 from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.folders import read_options
 from cvo_export.scene.drive import Drive
 from cvo_export.scene.flight import DEGREES_OF_FREEDOM, Flight
 from cvo_export.scene.recording import Recording
@@ -78,7 +79,7 @@ def open_synthetic(spec: str = "room") -> PoseDataset:
             f"expected a synthetic scene named room or street, found {name!r} in {spec!r}"
         )
     place = _PLACES[name]
-    options = _parse(spec, items, place)
+    options = _parse(name, items, place)
     fx = place.focal_per_width * options.width
     intrinsics = Intrinsics(fx, fx, (options.width - 1) / 2, (options.height - 1) / 2)
     recordings = [place.record(options, number) for number in range(options.recordings)]
@@ -129,51 +130,52 @@ _PLACES = {
 }
 
 
-def _parse(spec: str, items: list[str], place: _Place) -> _Options:
-    values: dict[str, int] = {}
-    still: tuple[str, ...] = ()
-    tag_m: float | None = None
-    for item in items:
-        key, _, text = item.partition("=")
-        if key not in place.keys or (key == "still" and still) or (key == "tag" and tag_m):
-            raise UsageError(
-                f"expected an option {'=, '.join(place.keys[:-1])}= or {place.keys[-1]}=, each "
-                f"once, found {item!r} in {spec!r}"
-            )
+def _parse(name: str, items: list[str], place: _Place) -> _Options:
+    found: dict[str, Any] = {}
+    for key, text in read_options(f"synthetic:{name}: expected", items, place.keys).items():
         if key == "size":
             width, _, height = text.partition("x")
-            found = {"width": width, "height": height}
+            expected = f"{_SIZES}, found {key}={text}"
+            found["width"] = _whole("width", width, expected)
+            found["height"] = _whole("height", height, expected)
         elif key == "still":
-            still, found = tuple(text.split("+")), {}
-            if not set(still) <= set(DEGREES_OF_FREEDOM):
-                raise UsageError(
-                    f"expected still= with names among {'+'.join(DEGREES_OF_FREEDOM)}, found "
-                    f"{item!r}"
-                )
+            found["still"] = _names(text)
         elif key == "tag":
-            found, tag_m = {}, _edge(text)
-            if tag_m is None:
-                raise UsageError(f"expected tag=0.02..0.3 in metres, found {item!r} in {spec!r}")
+            found["tag_m"] = _edge(text)
         else:
-            found = {"recordings" if key == f"{place.recording}s" else key: text}
-        for field, digits in found.items():
-            if field in values:
-                raise UsageError(f"expected {key} once, found it twice in {spec!r}")
+            field = "recordings" if key == f"{place.recording}s" else key
             low, high = _RANGES[field]
-            if not (digits.isascii() and digits.isdigit() and low <= int(digits) <= high):
-                expected = _SIZES if key == "size" else f"{key}={low}..{high}"
-                raise UsageError(f"expected {expected}, found {item!r} in {spec!r}")
-            values[field] = int(digits)
-    return place.default._replace(**values, still=still, tag_m=tag_m or 0.0)
+            found[field] = _whole(field, text, f"{key}={low}..{high}, found {key}={text}")
+    return place.default._replace(**found)
 
 
-def _edge(text: str) -> float | None:
-    """Return the edge length of a tag that fits on the wall, or None."""
+def _whole(field: str, text: str, expected: str) -> int:
+    """Return the number of a field; raises UsageError with what was expected if out of range."""
+    low, high = _RANGES[field]
+    if not (text.isascii() and text.isdigit() and low <= int(text) <= high):
+        raise UsageError(f"expected {expected}")
+    return int(text)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Return the degrees of freedom that are held; raises UsageError."""
+    names = tuple(text.split("+"))
+    if not set(names) <= set(DEGREES_OF_FREEDOM):
+        raise UsageError(
+            f"expected still= with names among {'+'.join(DEGREES_OF_FREEDOM)}, found still={text}"
+        )
+    return names
+
+
+def _edge(text: str) -> float:
+    """Return the edge length of a tag that fits on the wall; raises UsageError."""
     try:
         edge = float(text)
     except ValueError:
-        return None
-    return edge if 0.02 <= edge <= 0.3 else None
+        edge = 0.0
+    if not 0.02 <= edge <= 0.3:
+        raise UsageError(f"expected tag=0.02..0.3 in metres, found tag={text}")
+    return edge
 
 
 _RANGES = {
