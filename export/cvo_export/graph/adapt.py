@@ -65,15 +65,15 @@ def adapted(
     value = _own_input(model, given.name)
     model = compose.add_prefix(model, _OWN)
     nodes = Nodes("adapter/")
-    shape = _put_image_before(model, nodes, value, given, size)
-    sizes = _element_counts(model, nodes, shape)
-    results = _pose_of(nodes, outputs, sizes)
+    plane = _put_image_before(model, nodes, value, given, size)
+    shapes = _output_shapes(model, nodes, plane)
+    results = _pose_of(nodes, outputs, shapes)
     for role in ("lower", "upper"):
         if role in outputs:
-            results[role] = _flat(nodes, role, outputs[role], sizes, (6,))
+            results[role] = _flat(nodes, role, outputs[role], shapes, (6,))
     for name, result in results.items():
         nodes.name(result, name)
-    model.graph.node.extend(nodes.after)
+    model.graph.node.extend(nodes.taken())
     model.graph.initializer.extend(nodes.constants)
     del model.graph.output[:]
     for name in results:
@@ -95,9 +95,9 @@ def image_before(
     value = _own_input(model, given.name)
     model = compose.add_prefix(model, _OWN)
     nodes = Nodes("adapter/")
-    shape = _put_image_before(model, nodes, value, given, size)
+    plane = _put_image_before(model, nodes, value, given, size)
     model.graph.initializer.extend(nodes.constants)
-    return model.SerializeToString(), _OWN, shape
+    return model.SerializeToString(), _OWN, plane
 
 
 def pose_behind(
@@ -111,7 +111,7 @@ def pose_behind(
     nodes.name(_pose_of(nodes, outputs, shapes)["pose"], "pose")
     ports = {form.name: _OWN + form.name for form in outputs.values()}
     graph = helper.make_graph(
-        nodes.after,
+        nodes.taken(),
         "pose",
         [
             helper.make_tensor_value_info(port, TensorProto.FLOAT, shapes[name])
@@ -158,6 +158,26 @@ def _put_image_before(
     size: tuple[int, int] | None,
 ) -> tuple[int, int]:
     """Replace the input by ``image``; return its height and width."""
+    layout, height, width = _image_form(value, given, size)
+    image = _converted(nodes, given, layout, value.type.tensor_type.elem_type)
+    nodes.name(image, _OWN + value.name)
+    graph = model.graph
+    behind = list(graph.node)
+    del graph.node[:]
+    graph.node.extend([*nodes.taken(), *behind])
+    kept = [entry for entry in graph.input if entry.name != _OWN + value.name]
+    del graph.input[:]
+    shape = [1, height, width, 3]
+    graph.input.extend([helper.make_tensor_value_info("image", TensorProto.UINT8, shape), *kept])
+    # Inner shapes may still name the dynamic dimensions, which are fixed now.
+    del graph.value_info[:]
+    return height, width
+
+
+def _image_form(
+    value: onnx.ValueInfoProto, given: InputForm, size: tuple[int, int] | None
+) -> tuple[str, int, int]:
+    """Return layout, height and width of the input; raises if the options do not fit it."""
     kind = value.type.tensor_type.elem_type
     dims, form = sizes(value), tensor_text(value)
     layout = given.layout or ("nchw" if dims[1] == 3 else "nhwc" if dims[3] == 3 else None)
@@ -185,6 +205,11 @@ def _put_image_before(
             f"--input: expected range=0-1 or range=0-255 for {form}, found neither; it is the range"
             " that mean and std refer to, or that the network takes"
         )
+    return layout, height, width
+
+
+def _converted(nodes: Nodes, given: InputForm, layout: str, kind: int) -> str:
+    """Return ``image`` as the network takes it: range, order, layout and type of element."""
     image = "image"
     if kind != TensorProto.UINT8:
         image = nodes("Cast", image, to=TensorProto.FLOAT)
@@ -200,27 +225,13 @@ def _put_image_before(
         image = nodes("Transpose", image, perm=[0, 3, 1, 2])
     if kind in (TensorProto.FLOAT16, TensorProto.DOUBLE):
         image = nodes("Cast", image, to=kind)
-    if image == "image":
-        image = nodes("Identity", image)
-    nodes.name(image, _OWN + value.name)
-    before = nodes.taken()
-    graph = model.graph
-    behind = list(graph.node)
-    del graph.node[:]
-    graph.node.extend([*before, *behind])
-    kept = [entry for entry in graph.input if entry.name != _OWN + value.name]
-    del graph.input[:]
-    shape = [1, height, width, 3]
-    graph.input.extend([helper.make_tensor_value_info("image", TensorProto.UINT8, shape), *kept])
-    # Inner shapes may still name the dynamic dimensions, which are fixed now.
-    del graph.value_info[:]
-    return height, width
+    return nodes("Identity", image) if image == "image" else image
 
 
-def _element_counts(
-    model: onnx.ModelProto, nodes: Nodes, shape: tuple[int, int]
+def _output_shapes(
+    model: onnx.ModelProto, nodes: Nodes, plane: tuple[int, int]
 ) -> dict[str, tuple[int, ...]]:
-    """Run the network once and return the shape of each of its own outputs."""
+    """Run the network on an image of height and width; return the shapes of its own outputs."""
     probe = onnx.ModelProto()
     probe.CopyFrom(model)
     probe.graph.initializer.extend(nodes.constants)
@@ -231,11 +242,11 @@ def _element_counts(
             probe.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
         names = [port.name for port in engine.get_outputs()]
-        found = engine.run(None, {"image": np.zeros((1, *shape, 3), np.uint8)})
+        found = engine.run(None, {"image": np.zeros((1, *plane, 3), np.uint8)})
     # onnxruntime raises a dozen unrelated types here.
     except Exception as error:  # noqa: BLE001
         raise ModelError(
-            f"model: does not run on an image of {shape[0]}x{shape[1]} pixels: {one_line(error)}"
+            f"model: does not run on an image of {plane[0]}x{plane[1]} pixels: {one_line(error)}"
         ) from None
     shapes = zip(names, (values.shape for values in found), strict=True)
     return {name.removeprefix(_OWN): shape for name, shape in shapes}

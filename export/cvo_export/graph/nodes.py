@@ -31,7 +31,7 @@ class Nodes:
 
     def __init__(self, prefix: str) -> None:
         self.prefix = prefix
-        self.after: list[onnx.NodeProto] = []
+        self._nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
         self._count = 0
 
@@ -39,7 +39,7 @@ class Nodes:
         """Append one node."""
         self._count += 1
         result = f"{self.prefix}{self._count}"
-        self.after.append(
+        self._nodes.append(
             helper.make_node(kind, inputs, [result], **attributes)  # type: ignore[arg-type]
         )
         return result
@@ -52,12 +52,12 @@ class Nodes:
 
     def name(self, result: str, name: str) -> None:
         """Give a result that no other node reads yet its final name."""
-        for node in self.after:
+        for node in self._nodes:
             node.output[:] = [name if output == result else output for output in node.output]
 
     def taken(self) -> list[onnx.NodeProto]:
         """Return the nodes so far and start anew."""
-        taken, self.after = self.after, []
+        taken, self._nodes = self._nodes, []
         return taken
 
     def columns(self, values: str, indices: Iterable[int]) -> str:
