@@ -55,7 +55,7 @@ from cvo_export.bundles.observed import Observed
 from cvo_export.bundles.rule import chosen_rule
 from cvo_export.bundles.thresholds import calibrated
 from cvo_export.bundles.writing import check_target, write_bundle
-from cvo_export.data.errors import mean_pose_error, median_error
+from cvo_export.data.pose_errors import mean_pose_error, median_error
 from cvo_export.data.splits import Split, default_kind, make_split, same_split
 from cvo_export.datasets import PoseDataset
 from cvo_export.datasets.sizes import Size, one_size

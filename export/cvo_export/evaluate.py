@@ -24,8 +24,8 @@ from cvo_export.bundles.observed import observe
 from cvo_export.bundles.online import Schedule, Stage, online, online_lines
 from cvo_export.bundles.rule import chosen_rule
 from cvo_export.bundles.thresholds import with_thresholds
-from cvo_export.data.errors import MedianError, mean_pose_error
 from cvo_export.data.noise import Noise, noisy
+from cvo_export.data.pose_errors import MedianError, mean_pose_error
 from cvo_export.data.splits import Split, same_split
 from cvo_export.datasets import PoseDataset
 from cvo_export.vocabulary import Subset

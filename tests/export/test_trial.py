@@ -7,7 +7,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from cvo_edge.geometry import quaternion_conjugate, quaternion_multiply, quaternion_to_matrix
-from cvo_export.data.errors import mean_pose_error, median_error
+from cvo_export.data.pose_errors import mean_pose_error, median_error
 from cvo_export.datasets import open_dataset
 from cvo_export.graph.adapt_options import read_input, read_outputs, read_size
 from cvo_export.graph.trial import Form, tried

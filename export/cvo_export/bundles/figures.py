@@ -20,7 +20,7 @@ from cvo_export.bundles.choice import moving, workspace
 from cvo_export.bundles.observed import Observed
 from cvo_export.bundles.thresholds import effective_frames
 from cvo_export.bundles.volume import ellipsoids_log_volume
-from cvo_export.data.errors import pose_errors
+from cvo_export.data.pose_errors import pose_errors
 from cvo_export.datasets import PoseDataset
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.engine.observation import Observation
 from cvo_edge.estimate import Reason
-from cvo_export.data.errors import pose_errors
+from cvo_export.data.pose_errors import pose_errors
 
 
 class Refused:

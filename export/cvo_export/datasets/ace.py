@@ -17,8 +17,8 @@ from cvo_edge.errors import SourceError
 from cvo_edge.input.image_files import frame_name, natural_key
 from cvo_edge.trajectories.poses import read_pose_matrix
 from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.camera_matrices import matrix_intrinsics, read_numbers
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.matrices import matrix_intrinsics, read_numbers
 
 _PARTS = ("train", "test")
 _KINDS = ("rgb", "poses", "calibration")

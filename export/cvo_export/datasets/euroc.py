@@ -25,8 +25,8 @@ from cvo_edge.trajectories.tables import read_rows
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.sensors import pinhole, read_document
-from cvo_export.datasets.stamps import add_associated
+from cvo_export.datasets.nearest_poses import add_associated
+from cvo_export.datasets.yaml_cameras import pinhole, read_document
 
 Array = NDArray[np.float64]
 

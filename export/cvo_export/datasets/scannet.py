@@ -13,9 +13,9 @@ from pathlib import Path
 from cvo_edge.input.image_files import natural_key
 from cvo_edge.trajectories.poses import read_pose_matrix
 from cvo_export.datasets.base import PoseDataset
+from cvo_export.datasets.camera_matrices import centred, matrix_intrinsics, read_numbers
 from cvo_export.datasets.folders import only_world
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.matrices import centred, matrix_intrinsics, read_numbers
 
 _IMAGES, _POSES, _CAMERA = "color", "pose", "intrinsic/intrinsic_color.txt"
 

@@ -16,7 +16,7 @@ from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS, read_tum
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.stamps import add_associated
+from cvo_export.datasets.nearest_poses import add_associated
 
 # Intrinsics and distortion of the colour cameras at 640x480, as calibrated by the data set's
 # authors ("File formats", table of intrinsics of the RGB cameras). The images of freiburg3 are

@@ -26,8 +26,8 @@ from cvo_edge.trajectories.tables import read_rows
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.sensors import pinhole, read_document, rigid_transform
-from cvo_export.datasets.track import Track
+from cvo_export.datasets.interpolation import Track
+from cvo_export.datasets.yaml_cameras import pinhole, read_document, rigid_transform
 
 _IMAGES = "mav0/cam0/data.csv"
 _POSES = ("mav0/mocap0/data.csv", "dso/gt_imu.csv")

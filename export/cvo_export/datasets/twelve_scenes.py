@@ -18,9 +18,9 @@ from cvo_edge.input.image_files import frame_name, natural_key
 from cvo_edge.trajectories.poses import MATRIX_SUFFIX, read_pose_matrix
 from cvo_edge.trajectories.tables import read_text
 from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.camera_matrices import matrix_intrinsics
 from cvo_export.datasets.folders import only_world
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.matrices import matrix_intrinsics
 
 _INFO, _SPLIT = "info.txt", "split.txt"
 _SPLIT_FORM = "sequenceN [frames=COUNT] [start=FIRST ; end=LAST]"

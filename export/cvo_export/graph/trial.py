@@ -24,7 +24,7 @@ from cvo_edge.errors import ModelError, SourceError
 from cvo_edge.input import preprocess
 from cvo_edge.pose import about
 from cvo_edge.vocabulary import Crop
-from cvo_export.data.errors import MedianError, mean_pose_error, median_error
+from cvo_export.data.pose_errors import MedianError, mean_pose_error, median_error
 from cvo_export.datasets import PoseDataset
 from cvo_export.graph.adapt import image_before, pose_behind
 from cvo_export.graph.adapt_options import InputForm, OutputForm, input_text, output_text
