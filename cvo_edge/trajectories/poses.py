@@ -20,13 +20,15 @@ _MAX_MATRIX_BYTES = 1 << 16
 
 # Files round quaternions and matrices to a few digits.
 _TOLERANCE = 0.01
+# Further away than the moon: no coordinates of a place. Networks' outputs have the same limit.
+_FARTHEST_M = 1e9
 
 
 def quaternion_pose(position_m: Array, q_xyzw: Array) -> Array | None:
     """Return the pose (7,) of a position (3,), metres, and a quaternion (4,); unit, qw >= 0.
 
-    Norms within 0.01 of 1 are normalised. Returns None for other norms and for numbers that are not
-    finite; ``quaternion_fault`` says which it is.
+    Norms within 0.01 of 1 are normalised. Returns None for other norms, for numbers that are not
+    finite and for positions of 1e9 m or more; ``quaternion_fault`` says which it is.
     """
     if quaternion_fault(position_m, q_xyzw) is not None:
         return None
@@ -35,11 +37,20 @@ def quaternion_pose(position_m: Array, q_xyzw: Array) -> Array | None:
 
 def quaternion_fault(position_m: Array, q_xyzw: Array) -> str | None:
     """Return why a position and a quaternion are no pose, or None."""
-    if not (np.isfinite(position_m).all() and np.isfinite(q_xyzw).all()):
+    if not np.isfinite(q_xyzw).all():
         return "a number that is not finite"
+    if (fault := _position_fault(position_m)) is not None:
+        return fault
     with np.errstate(over="ignore"):
         norm = float(np.linalg.norm(q_xyzw))
     return None if abs(norm - 1.0) <= _TOLERANCE else f"a quaternion of norm {norm:.3g}"
+
+
+def _position_fault(position_m: Array) -> str | None:
+    if not np.isfinite(position_m).all():
+        return "a number that is not finite"
+    most = float(np.abs(position_m).max())
+    return None if most < _FARTHEST_M else f"a position {most:.3g} m from the origin"
 
 
 def camera_pose(pose: Array | None, T_body_camera: Array) -> Array | None:
@@ -53,8 +64,8 @@ def matrix_to_pose(T: Array) -> Array | None:
     """Homogeneous matrix (4, 4) in metres -> pose (7,), or None if it is invalid.
 
     The rotation is made orthonormal (recorded ones deviate by up to 4e-4). A matrix is invalid if
-    it is not finite or its rotation part is more than 0.01 away from a rotation; ``matrix_fault``
-    says which it is.
+    it is not finite, its position is 1e9 m or more away, or its rotation part is more than 0.01
+    away from a rotation; ``matrix_fault`` says which it is.
     """
     if matrix_fault(T) is not None:
         return None
@@ -66,6 +77,8 @@ def matrix_fault(T: Array) -> str | None:
     """Return why a matrix (4, 4) is no pose, or None."""
     if not np.isfinite(T).all():
         return "a number that is not finite"
+    if (fault := _position_fault(T[:3, 3])) is not None:
+        return fault
     off = float(np.abs(geometry.nearest_rotation(T[:3, :3]) - T[:3, :3]).max())
     if off > _TOLERANCE:
         return f"a matrix {off:.3g} away from a rotation"

@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 _SHOWN = 80
 _MAX_BYTES = 256 << 20
 
-# The year 5138. Larger numbers are stamps in a smaller unit.
-_LAST_S = 10**11
+# 64 bits hold nanoseconds up to the year 2262. Larger numbers are stamps in a smaller unit.
+_LAST_NS = 2**63 - 1
 
 
 class Row(NamedTuple):
@@ -45,7 +45,7 @@ class Row(NamedTuple):
             stamp_ns = seconds_to_ns(self.fields[0])
         except ValueError:
             raise self.refusal() from None
-        if abs(stamp_ns) > _LAST_S * 10**9:
+        if abs(stamp_ns) > _LAST_NS:
             found = f"found {self.fields[0][:_SHOWN]} in line {self.number}"
             raise SourceError(
                 f"{self.path}: expected stamps in seconds, {found}; convert nanoseconds (or "
@@ -55,8 +55,8 @@ class Row(NamedTuple):
 
     def nanoseconds(self) -> int:
         """Return the first column, a time in integer nanoseconds."""
-        # 19 digits are the most that fit into 64 bits.
-        if not (self.fields[0].isdecimal() and len(self.fields[0]) <= 19):
+        digits = self.fields[0]
+        if not (digits.isdecimal() and len(digits) <= 19 and int(digits) <= _LAST_NS):
             raise self.refusal()
         return int(self.fields[0])
 

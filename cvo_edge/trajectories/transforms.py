@@ -49,10 +49,11 @@ def frame_poses(file: Path, document: dict[str, Any]) -> list[Entry[str]]:
 def _entry(name: str, matrix: object, where: str) -> Entry[str]:
     try:
         T = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         T = np.empty(0)
     if T.shape == (3, 4):
         T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
     if T.shape != (4, 4):
         return Entry(name, None, where, "a matrix that is not 4x4")
-    return Entry(name, matrix_to_pose(T @ _AXES), where, matrix_fault(T))
+    fault = matrix_fault(T)
+    return Entry(name, None if fault else matrix_to_pose(T @ _AXES), where, fault)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from cvo_edge.errors import UsageError
+from cvo_edge.errors import SourceError, UsageError
 from cvo_export.datasets.ace import open_ace
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.colmap import open_colmap
@@ -57,4 +57,8 @@ def open_dataset(text: str) -> PoseDataset:
             f"data set: expected FORMAT:PATH with FORMAT one of {', '.join(FORMATS)}, "
             f"found {text!r}"
         )
-    return FORMATS[name](path)
+    try:
+        return FORMATS[name](path)
+    except OSError as error:
+        where = error.filename or path
+        raise SourceError(f"{where}: expected a data set; cannot read: {error.strerror}") from None

@@ -15,7 +15,6 @@ import numpy as np
 
 from cvo_edge.errors import SourceError
 from cvo_edge.input.image_files import frame_name, natural_key
-from cvo_edge.trajectories.poses import read_pose_matrix
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.camera_matrices import matrix_intrinsics, read_numbers
 from cvo_export.datasets.frames import FrameList
@@ -52,7 +51,7 @@ def open_ace(path: str) -> PoseDataset:
             name = frame_name(image.name)
             recording = _RECORDING.match(name)
             sequence = f"{part}/{recording[1]}" if recording else part
-            frames.add(sequence, name, image, read_pose_matrix(pose_file))
+            frames.add_matrix(sequence, name, image, pose_file)
             calibrations.append(calibration)
     dataset = frames.dataset(root.resolve().name)
     intrinsics, chosen = _camera(calibrations, dataset)

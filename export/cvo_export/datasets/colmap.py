@@ -6,6 +6,7 @@ the points are not read. Poses are read as ``cvo_edge.trajectories.colmap`` desc
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,11 +17,12 @@ from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
 from cvo_edge.input.image_files import natural_key
 from cvo_edge.trajectories.colmap import Image, model_folder, read_images
-from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
+from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.camera_groups import MOST_SPREAD, alike
 from cvo_export.datasets.colmap_cameras import Stated, read_cameras
 from cvo_export.datasets.folders import path_options
 from cvo_export.datasets.frames import FrameList
+from cvo_export.datasets.sizes import with_camera
 
 # Cameras, numbers and folders that a message names; the others are counted.
 _NAMED, _FEW = 8, 3
@@ -70,7 +72,7 @@ def open_colmap(path: str) -> PoseDataset:
         raise SourceError(f"{folder}: expected a camera {min(missing)} of an image, found none")
     present = [image for image in found if image.pose is not None]
     if len({image.camera for image in present}) > 1:
-        present = [image for image in present if (images / image.name).is_file()]
+        present = [image for image in present if os.path.isfile(images / image.name)]  # noqa: PTH113
     groups = _groups(cameras, present or found)
     group = _choose(folder, place, groups, options.get("camera"))
     others = {number for each in groups if each is not group for number in each.numbers}
@@ -85,19 +87,9 @@ def open_colmap(path: str) -> PoseDataset:
         frames.add(sequence, name.stem, images / image.name, image.pose, where=where)
     dataset = frames.dataset(root.resolve().name)
     camera = group.camera or cameras[group.numbers[0]].camera()
-    height, width = dataset.read_image(0).shape[:2]
-    if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
-        raise SourceError(
-            f"{images}: expected images of {camera.width}x{camera.height} or of that shape, as the "
-            f"model states, found {width}x{height}"
-        )
-    camera = camera.scaled(width, height)
-    return replace(
-        dataset,
-        intrinsics=Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy),
-        lens=Lens(camera.distortion, camera.coefficients),
-        chosen="; ".join(filter(None, [group.text if others else "", group.merged])),
-    )
+    chosen = "; ".join(filter(None, [group.text if others else "", group.merged]))
+    where = cameras[group.numbers[0]].where
+    return replace(with_camera(dataset, where, camera), chosen=chosen)
 
 
 def _model_folder(root: Path) -> Path:

@@ -9,7 +9,6 @@ Images are grey and returned as BGR. Lens distortion is read, not corrected.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +21,11 @@ from cvo_edge.trajectories.euroc import (
     read_euroc,
 )
 from cvo_edge.trajectories.tables import read_rows
-from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
+from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
 from cvo_export.datasets.nearest_poses import add_associated
-from cvo_export.datasets.yaml_cameras import pinhole, read_document
+from cvo_export.datasets.yaml_cameras import Pinhole, pinhole, read_document
 
 Array = NDArray[np.float64]
 
@@ -51,7 +50,7 @@ def open_euroc(path: str) -> PoseDataset:
     """
     root = Path(path)
     frames = FrameList(root)
-    cameras: dict[str, tuple[Intrinsics, Lens] | None] = {}
+    cameras: dict[str, Pinhole | None] = {}
     for name, folder in recordings(root, _IMAGES).items():
         other = next((each for each in _OF_TUM_VI if (folder / each).is_dir()), None)
         if other and not (folder / _POSES).is_file():
@@ -64,7 +63,7 @@ def open_euroc(path: str) -> PoseDataset:
     camera = only_camera(root, cameras)
     if camera is None:
         return dataset
-    return replace(dataset, intrinsics=camera[0], lens=camera[1])
+    return camera.of(dataset, f"{root}: {_CAMERA}")
 
 
 def _add_recording(frames: FrameList, name: str, folder: Path, T_body_camera: Array) -> None:
@@ -75,7 +74,7 @@ def _add_recording(frames: FrameList, name: str, folder: Path, T_body_camera: Ar
     add_associated(frames, name, images, trajectory, MAX_STAMP_DIFFERENCE_NS)
 
 
-def _read_camera(path: Path) -> tuple[tuple[Intrinsics, Lens] | None, Array]:
+def _read_camera(path: Path) -> tuple[Pinhole | None, Array]:
     """Return the intrinsics with the lens, and ``T_body_camera``, shape (4, 4), metres."""
     document = read_document(path, "T_BS")
     return pinhole(path, document, "distortion_coefficients"), read_body_camera(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from cvo_edge.errors import SourceError
 from cvo_edge.input.decoding import decode_image, image_size
 from cvo_edge.input.image_files import frame_name, images_in
+from cvo_edge.trajectories.poses import pose_matrix_fault, read_pose_matrix
 from cvo_edge.trajectories.trajectory import LISTED_TWICE, Skipped, Trajectory
 from cvo_export.datasets.base import PoseDataset
 
@@ -61,7 +63,7 @@ class FrameList:
         frame = f"{sequence}/{name}"
         if pose is None:
             self.skip("invalid pose", where)
-        elif not image.is_file():
+        elif not os.path.isfile(image):  # noqa: PTH113 - also of a name too long
             self.skip("image missing")
         elif frame in self._frame_names:
             self.skip(LISTED_TWICE)
@@ -72,6 +74,15 @@ class FrameList:
             self._poses.append(pose)
             self._sequence.append(number)
             self._stamps_ns.append(stamp_ns)
+
+    def add_matrix(self, sequence: str, name: str, image: Path, pose_file: Path) -> None:
+        """Add a frame with the 4x4 matrix of a file, or count it as skipped."""
+        if not pose_file.is_file():
+            self.skip("no pose file")
+            return
+        pose = read_pose_matrix(pose_file)
+        where = "" if pose is not None else f"{pose_file.name}: {pose_matrix_fault(pose_file)}"
+        self.add(sequence, name, image, pose, where=where)
 
     def add_numbered(
         self,

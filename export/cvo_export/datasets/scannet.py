@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from cvo_edge.input.image_files import natural_key
-from cvo_edge.trajectories.poses import read_pose_matrix
 from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.camera_matrices import centred, matrix_intrinsics, read_numbers
 from cvo_export.datasets.folders import only_world
@@ -40,11 +39,7 @@ def open_scannet(path: str) -> PoseDataset:
     frames = FrameList(scan)
     name = scan.resolve().name
     for image in frames.colour_images(scan / _IMAGES):
-        pose_file = scan / _POSES / f"{image.stem}.txt"
-        if pose_file.is_file():
-            frames.add(name, image.stem, image, read_pose_matrix(pose_file))
-        else:
-            frames.skip("no pose file")
+        frames.add_matrix(name, image.stem, image, scan / _POSES / f"{image.stem}.txt")
     dataset = frames.dataset(name)
     camera = scan / _CAMERA
     if not camera.is_file():

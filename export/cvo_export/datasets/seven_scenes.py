@@ -17,7 +17,7 @@ import numpy as np
 from cvo_edge.errors import SinkError, SourceError
 from cvo_edge.input.image_files import frame_name, natural_key
 from cvo_edge.pose import Pose
-from cvo_edge.trajectories.poses import MATRIX_SUFFIX, pose_matrix_fault, read_pose_matrix
+from cvo_edge.trajectories.poses import MATRIX_SUFFIX
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.frames import FrameList
 
@@ -52,13 +52,7 @@ def open_seven_scenes(path: str) -> PoseDataset:
     for folder in folders:
         for image in frames.colour_images(folder):
             name = frame_name(image.name)
-            pose_file = folder / (name + MATRIX_SUFFIX)
-            if pose_file.is_file():
-                pose = read_pose_matrix(pose_file)
-                fault = f": {pose_matrix_fault(pose_file)}" if pose is None else ""
-                frames.add(folder.name, name, image, pose, where=f"{pose_file.name}{fault}")
-            else:
-                frames.skip("no pose file")
+            frames.add_matrix(folder.name, name, image, folder / (name + MATRIX_SUFFIX))
     dataset = frames.dataset(root.resolve().name)
     return replace(
         dataset,

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
+from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
-from cvo_export.datasets.base import PoseDataset
+from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 
 Size = tuple[int, int]
 
@@ -36,6 +38,26 @@ def one_size(dataset: PoseDataset) -> Size:
         )
     (size,) = sizes
     return size
+
+
+def with_camera(dataset: PoseDataset, where: str, camera: Camera) -> PoseDataset:
+    """Return the data set with a camera, scaled to the size of its images.
+
+    Raises SourceError, which begins with ``where``, if the images have another shape than the
+    camera, or if the first image cannot be read.
+    """
+    height, width = dataset.read_image(0).shape[:2]
+    if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
+        raise SourceError(
+            f"{where}: expected images of {camera.width}x{camera.height} or of that shape, as "
+            f"stated there, found {width}x{height}; resize them, or correct the numbers"
+        )
+    camera = camera.scaled(width, height)
+    return replace(
+        dataset,
+        intrinsics=Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy),
+        lens=Lens(camera.distortion, camera.coefficients),
+    )
 
 
 def sizes_text(sizes: Counter[Size]) -> str:

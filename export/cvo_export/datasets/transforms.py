@@ -7,7 +7,8 @@ of the first pixel the coordinates (0.5, 0.5), this project (0, 0).
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import os
+from collections import Counter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,10 +18,11 @@ from numpy.typing import NDArray
 from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
 from cvo_edge.trajectories.transforms import FILE, frame_poses, read_document
-from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
+from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.colmap_cameras import camera_of
 from cvo_export.datasets.folders import only_camera
 from cvo_export.datasets.frames import FrameList
+from cvo_export.datasets.sizes import with_camera
 
 Array = NDArray[np.float64]
 
@@ -44,16 +46,18 @@ def open_nerfstudio(path: str) -> PoseDataset:
     document = read_document(file)
     root = file.absolute().parent
     frames = FrameList(file)
-    listed: dict[str, list[tuple[str, Path, Array | None, str]]] = {}
+    listed: dict[PurePosixPath, list[tuple[str, Path, Array | None, str]]] = {}
     for name, pose, where, fault in frame_poses(file, document):
         place = PurePosixPath(name)
         tried = [root / (name + suffix) for suffix in _SUFFIXES]
-        image = next((each for each in tried if each.is_file()), tried[0])
-        folder = place.parent.name
+        image = next((each for each in tried if os.path.isfile(each)), tried[0])  # noqa: PTH113
         fault_at = f"{where}: {fault}" if pose is None else ""
         entry = (place.stem if image == tried[0] else place.name, image, pose, fault_at)
-        listed.setdefault(folder or root.name, []).append(entry)
-    for sequence, entries in listed.items():
+        listed.setdefault(place.parent, []).append(entry)
+    shared = Counter(folder.name for folder in listed)
+    for folder, entries in listed.items():
+        # Of cam0/images and cam1/images, the last part is no name.
+        sequence = (str(folder) if shared[folder.name] > 1 else folder.name) or root.name
         for stem, image, pose, fault_at in entries:
             frames.add(sequence, stem, image, pose, where=fault_at)
     dataset = frames.dataset(root.name)
@@ -65,12 +69,7 @@ def open_nerfstudio(path: str) -> PoseDataset:
     camera = only_camera(file, cameras)
     if camera is None:
         return dataset
-    camera = camera.scaled(width, height)
-    return replace(
-        dataset,
-        intrinsics=Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy),
-        lens=Lens(camera.distortion, camera.coefficients),
-    )
+    return with_camera(dataset, str(file), camera)
 
 
 def _camera(file: Path, values: dict[str, Any], size: tuple[int, int]) -> Camera | None:
@@ -92,7 +91,7 @@ def _camera(file: Path, values: dict[str, Any], size: tuple[int, int]) -> Camera
         centre = values.get("cx", width / 2), values.get("cy", height / 2)
         numbers = [float(value) for value in (fx, fy, *centre)]
         k3 = 0.0 if fisheye else float(values.get("k3", 0.0))
-    except (TypeError, ValueError, ZeroDivisionError) as error:
+    except (TypeError, ValueError, ArithmeticError) as error:
         raise SourceError(f"{file}: expected the numbers of a camera, found {error}") from None
     model = str(values.get("camera_model", "OPENCV_FISHEYE" if fisheye else "OPENCV"))
     if fisheye or any(lens) or k3:

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from cvo_edge.errors import SourceError
 from cvo_edge.trajectories.poses import matrix_to_pose, quaternion_pose
 from cvo_edge.trajectories.tables import read_rows
-from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
+from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
 from cvo_export.datasets.interpolation import Track
-from cvo_export.datasets.yaml_cameras import pinhole, read_document, rigid_transform
+from cvo_export.datasets.yaml_cameras import Pinhole, pinhole, read_document, rigid_transform
 
 _IMAGES = "mav0/cam0/data.csv"
 _POSES = ("mav0/mocap0/data.csv", "dso/gt_imu.csv")
@@ -54,7 +54,7 @@ def open_tum_vi(path: str) -> PoseDataset:
     """
     root = Path(path)
     frames = FrameList(root)
-    cameras: dict[str, tuple[Intrinsics, Lens] | None] = {}
+    cameras: dict[str, Pinhole | None] = {}
     partial: list[str] = []
     for name, folder in recordings(root, _IMAGES).items():
         cameras[name], T_imu_camera = _read_camera(folder / _CAMERA)
@@ -63,7 +63,7 @@ def open_tum_vi(path: str) -> PoseDataset:
     camera = only_camera(root, cameras)
     if camera is None:
         return dataset
-    return replace(dataset, intrinsics=camera[0], lens=camera[1])
+    return camera.of(dataset, f"{root}: {_CAMERA}")
 
 
 def _add_recording(
@@ -109,7 +109,7 @@ def _read_track(folder: Path) -> Track:
     return Track.of([row.nanoseconds() for row in rows], poses)
 
 
-def _read_camera(path: Path) -> tuple[tuple[Intrinsics, Lens] | None, NDArray[np.float64]]:
+def _read_camera(path: Path) -> tuple[Pinhole | None, NDArray[np.float64]]:
     """Return the intrinsics with the lens of ``cam0``, and ``T_imu_camera``, (4, 4), metres."""
     camera = read_document(path, "cam0 with T_cam_imu").get("cam0")
     if not isinstance(camera, dict):

@@ -15,12 +15,13 @@ from pathlib import Path
 from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
 from cvo_edge.input.image_files import frame_name, natural_key
-from cvo_edge.trajectories.poses import MATRIX_SUFFIX, read_pose_matrix
+from cvo_edge.trajectories.poses import MATRIX_SUFFIX
 from cvo_edge.trajectories.tables import read_text
-from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.camera_matrices import matrix_intrinsics
 from cvo_export.datasets.folders import only_world
 from cvo_export.datasets.frames import FrameList
+from cvo_export.datasets.sizes import with_camera
 
 _INFO, _SPLIT = "info.txt", "split.txt"
 _SPLIT_FORM = "sequenceN [frames=COUNT] [start=FIRST ; end=LAST]"
@@ -50,19 +51,16 @@ def open_twelve_scenes(path: str) -> PoseDataset:
         numbered = _FRAME.fullmatch(name)
         number = int(numbered[1]) if numbered else -1
         sequence = next((name for name, own in sequences.items() if number in own), None)
-        pose_file = image.with_name(name + MATRIX_SUFFIX)
         if sequence is None:
             frames.skip(f"in no sequence of {_SPLIT}")
-        elif not pose_file.is_file():
-            frames.skip("no pose file")
         else:
-            frames.add(sequence, name, image, read_pose_matrix(pose_file))
+            frames.add_matrix(sequence, name, image, image.with_name(name + MATRIX_SUFFIX))
     dataset = frames.dataset(scene.resolve().name)
     test = next(iter(sequences))
     own_test = {index for index, name in enumerate(dataset.sequence_names) if name == test}
+    info = scene / _INFO
     return replace(
-        dataset,
-        intrinsics=_intrinsics(scene / _INFO, dataset),
+        with_camera(dataset, str(info), _camera(info)),
         own_train=frozenset(range(len(dataset.sequence_names))) - own_test,
         own_test=frozenset(own_test),
     )
@@ -86,7 +84,7 @@ def _sequences(path: Path) -> dict[str, range]:
     return found
 
 
-def _intrinsics(path: Path, dataset: PoseDataset) -> Intrinsics:
+def _camera(path: Path) -> Camera:
     form = f"lines m_colorWidth, m_colorHeight and {_MATRIX} = 16 numbers"
     values = {
         key.strip(): value.split()
@@ -101,12 +99,4 @@ def _intrinsics(path: Path, dataset: PoseDataset) -> Intrinsics:
         found = {key: value for key, value in values.items() if "olor" in key}
         raise SourceError(f"{path}: expected {form}, found {str(found)[:160]}") from None
     intrinsics = matrix_intrinsics(str(path), numbers)
-    image_height, image_width = dataset.read_image(0).shape[:2]
-    if abs(image_width * height - image_height * width) > max(width, height):
-        raise SourceError(
-            f"{path}: expected colour images of {width}x{height} or of that shape, found "
-            f"{image_width}x{image_height}; resize them, or correct the numbers"
-        )
-    camera = Camera(width=width, height=height, **intrinsics._asdict())
-    camera = camera.scaled(image_width, image_height)
-    return Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
+    return Camera(width=width, height=height, **intrinsics._asdict())
