@@ -15,6 +15,7 @@ from cvo_export.networks.heads.cjp import CjpConfig
 from cvo_export.networks.heads.cqr import CqrConfig
 from cvo_export.networks.heads.csp import CspConfig
 from cvo_export.networks.heads.mcqr import McqrConfig
+from cvo_export.networks.standardised import fit_target
 from cvo_export.publish import publish
 from cvo_export.training.loop import train
 from cvo_export.training.run import load_run
@@ -64,3 +65,11 @@ def test_other_methods_learn_full_turns_and_are_restored(tmp_path: Path, head: A
     restored = load_run(tmp_path / "run")
     state = run.graph.head.state_dict()
     assert all((restored.graph.head.state_dict()[name] == state[name]).all() for name in state)
+
+
+def test_a_recording_that_turns_outside_training_is_learned_for_any_rotation():
+    poses = np.zeros((40, 7))
+    angle = np.linspace(0.0, 1.5 * np.pi, 40)
+    poses[:, 5], poses[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
+    assert not fit_target(poses[:10]).turns
+    assert fit_target(poses[:10], poses).turns

@@ -89,11 +89,19 @@ class Target:
         )
 
 
-def fit_target(poses: Array) -> Target:
-    """Fit the standardised numbers to training poses (n, 7)."""
+def fit_target(poses: Array, every: Array | None = None) -> Target:
+    """Fit the standardised numbers to training poses (n, 7).
+
+    ``every`` has the poses (m, 7) of all frames, by default those of training: if any of them turns
+    further than 2 rad from the mean rotation, the target is that for any rotation, because frames
+    of other roles would reach the place where the chart breaks. The decision treats the frames of
+    ``cal`` and ``test`` alike, so that they stay exchangeable.
+    """
     reference = geometry.mean_rotation(poses[:, 3:])
-    coordinates = Chart("tangent_reference", reference).coordinates(poses, poses)
-    spread = float(np.linalg.norm(coordinates[:, 3:], axis=1).max())
+    chart = Chart("tangent_reference", reference)
+    coordinates = chart.coordinates(poses, poses)
+    judged = coordinates if every is None else chart.coordinates(every, every)
+    spread = float(np.linalg.norm(judged[:, 3:], axis=1).max())
     deviation = coordinates.std(axis=0)
     floor = deviation_floor(deviation)
     still = deviation < floor

@@ -81,7 +81,8 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     torch.manual_seed(config.seed)
     backbone, upper, weights_sha256 = loaded_backbone(config, config.weights)
     indices, n_train = _training_frames(config, dataset, split)
-    target = fit_target(dataset.local_poses[indices])
+    poses = dataset.local_poses
+    target = fit_target(poses[indices], poses)
     _check_turns(config, target)
     claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
