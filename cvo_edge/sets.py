@@ -127,15 +127,13 @@ class ConformalSet:
         sides = [*zip(about * 2, [*self.lower[3:].tolist(), *self.upper[3:].tolist()], strict=True)]
         if not any(math.pi < abs(bound - at) < math.inf for at, bound in sides):
             return self
-        trimmed = np.array([_trimmed(at, bound) for at, bound in sides])
+        low, high = np.split(np.array([_trimmed(at, bound) for at, bound in sides]), 2)
         bands = self.bands
         if bands is not None:
-            turns = (
-                tuple((_trimmed(at, low), _trimmed(at, high)) for low, high in row)
-                for at, row in zip(about, bands[3:], strict=True)
-            )
+            turns = [_trimmed_bands(at, row) for at, row in zip(about, bands[3:], strict=True)]
             bands = (*bands[:3], *turns)
-        lower, upper = (np.r_[self.lower[:3], trimmed[:3]], np.r_[self.upper[:3], trimmed[3:]])
+            low, high = np.array([(row[0][0], row[-1][1]) for row in turns]).T
+        lower, upper = np.r_[self.lower[:3], low], np.r_[self.upper[:3], high]
         return replace(self, lower=lower, upper=upper, bands=bands)
 
     def moved(self, offset_m: Array) -> ConformalSet:
@@ -201,6 +199,14 @@ class ConformalSet:
 def _trimmed(at: float, bound: float) -> float:
     """Return a finite bound within half a turn of a coordinate."""
     return min(max(bound, at - math.pi), at + math.pi) if math.isfinite(bound) else bound
+
+
+def _trimmed_bands(
+    at: float, row: tuple[tuple[float, float], ...]
+) -> tuple[tuple[float, float], ...]:
+    """Return the bands within half a turn of a coordinate; an end where there are none."""
+    near = [(low, high) for low, high in row if low <= at + math.pi and high >= at - math.pi]
+    return tuple((_trimmed(at, low), _trimmed(at, high)) for low, high in near or row[:1])
 
 
 _UNBOUNDED = ConformalSet(np.full(6, -np.inf), np.full(6, np.inf))
