@@ -23,6 +23,7 @@ from cvo_export.training.run import load_run
 from .conftest import ignore_progress, tiny_config
 
 _ROBOT = "synthetic:room,flights=8,frames=40,size=64x48,turn=1,still=z+pitch+roll"
+_FEW = "synthetic:room,flights=6,frames=30,size=64x48,turn=1,still=z+pitch+roll"
 
 
 def _bundle(folder: Path, head: Any) -> Path:
@@ -59,7 +60,7 @@ def test_a_wheeled_robot_that_turns_round_gets_sets_that_hold(tmp_path: Path) ->
     [CqrConfig(trees=5), CspConfig(classes=8, label_sigma=4.0), McqrConfig(rays=8, directions=8)],
 )
 def test_other_methods_learn_full_turns_and_are_restored(tmp_path: Path, head: Any) -> None:
-    config = tiny_config(dataset=_ROBOT, head=head, steps=30, copies=1)
+    config = tiny_config(dataset=_FEW, head=head, steps=6, copies=1)
     run = train(tmp_path / "run", config, ignore_progress)
     assert run.target.turns
     restored = load_run(tmp_path / "run")
