@@ -11,15 +11,22 @@ from provenance import read_result, result_files
 from cvo_edge.vocabulary import Scope
 
 FOLDER = "recordings"
+CASES = (
+    *("redkitchen-400", "redkitchen-400-utm", "redkitchen-400-random"),
+    *("euroc-mh05", "euroc-mh05-random", "kitti-00", "kitti-00-random"),
+    *("room", "room-full-turn", "room-planar", "room-never-turns"),
+    *("street", "street-block"),
+)
 DOF = ("tx", "ty", "tz", "rx", "ry", "rz")
 
 
 def recordings() -> str:
     """One row for each recording and method; the figure of the same data unchanged beside it."""
     found = [read_result(FOLDER, path.stem) for path in result_files(FOLDER)]
+    found.sort(key=lambda each: CASES.index(each["case"]))
     return table(
         [
-            "recording", "frames: train, cal, test", "method", "median error", "one pose for all",
+            "recording", "frames: train, cal, test", "method", "median error", "mean pose",
             "coverage at 0.9 per DoF", "joint scope: all six", "median width", "`run`: `ok`",
         ],
         [row(each) for each in found],
@@ -38,7 +45,7 @@ def row(found: dict[str, Any]) -> list[str]:
         ", ".join(str(counts[role]) for role in ("train", "cal", "test")),
         evaluation["method"],
         error(evaluation["point_error"]),
-        error(found["constant"]),
+        error(evaluation["mean_pose_error"]),
         f"{np.mean(coverage):.2f}; {min(coverage):.2f} to {max(coverage):.2f}",
         f"{joint['joint_coverage']:.2f}",
         f"{length(mean_of(width, moving, (0, 1, 2)))}, "
@@ -60,7 +67,11 @@ def mean_of(width: np.ndarray, moving: list[int], kind: tuple[int, ...]) -> floa
 
 def error(median: dict[str, float]) -> str:
     """Return a position's and a rotation's median error."""
-    return f"{length(median['median_m'])}, {median['median_deg']:.2f} deg"
+    metres, degrees = (
+        next(value for name, value in median.items() if name in names)
+        for names in (("median_m", "position_m"), ("median_deg", "rotation_deg"))
+    )
+    return f"{length(metres)}, {degrees:.2f} deg"
 
 
 def length(value_m: float) -> str:

@@ -22,6 +22,7 @@ import comparison_tables
 import localiser_tables
 import promised_table
 import reconstruct_tables
+import recording_tables
 import speed_tables
 import study_tables
 import vigilance_tables
@@ -51,6 +52,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **speed_tables.TABLES,
     **vigilance_tables.TABLES,
     **promised_table.TABLES,
+    **recording_tables.TABLES,
     **reconstruct_tables.TABLES,
     "faults": faults,
     "goals": goals_table,
