@@ -121,13 +121,17 @@ def main() -> None:
         for method in options.methods:
             run, bundle = (options.work / kind / f"{case}-{method}" for kind in ("runs", "bundles"))
             print(f"== {case}, {method}", flush=True)
-            trained = call(
-                "cvo-export", "train", method, text, run, "--weights", WEIGHTS, "--cache",
-                options.work / "cache" / case, "--copies", str(options.copies),
-                "--steps", str(options.steps),
-                *(("--split", "random") if case.endswith("-random") else ()),
-            )  # fmt: skip
-            print(trained, call("cvo-export", "publish", run, bundle), flush=True)
+            if not bundle.exists():
+                print(
+                    call(
+                        "cvo-export", "train", method, text, run, "--weights", WEIGHTS, "--cache",
+                        options.work / "cache" / case, "--copies", str(options.copies),
+                        "--steps", str(options.steps),
+                        *(("--split", "random") if case.endswith("-random") else ()),
+                    ),
+                    call("cvo-export", "publish", run, bundle),
+                    flush=True,
+                )  # fmt: skip
             report = options.work / "reports" / f"{case}-{method}.json"
             report.parent.mkdir(parents=True, exist_ok=True)
             print(call("cvo-export", "evaluate", bundle, text, "--json", report), flush=True)
