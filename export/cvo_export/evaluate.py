@@ -34,7 +34,10 @@ Array = NDArray[np.float64]
 
 
 # Footnotes for coverage bands that are not exact.
-_INDICATIVE = "? indicative: frames of one recording are not independent draws"
+_INDICATIVE = (
+    "? indicative: frames of one recording are not independent draws; the band is that of as many "
+    "independent frames as they are worth, a dash says that these are too few"
+)
 _NO_CLAIM = "- no band: thresholds from clean frames guarantee nothing for noisy frames"
 # Error as a share of the mean pose's from which a network has learned next to nothing.
 _HARDLY_BETTER = 0.9
@@ -286,7 +289,8 @@ def _level_lines(
     ]
     for level in levels:
         coverage = "".join(f"{value:>7.3f}" for value in level["coverage"])
-        band = level["coverage_band"]
+        kind = "coverage_band" if level["coverage_band_exact"] else "coverage_band_effective"
+        band = level[kind]
         shown = "-" if band is None else f"{band[0]:.3f}-{band[1]:.3f}"
         shown += " " if level["coverage_band_exact"] or band is None else "?"
         width = np.array(level["median_width"])

@@ -348,8 +348,12 @@ def test_a_split_by_sequence_is_indicative_after_recalibration(tiny_bundle, tmp_
     assert not level["coverage_band_exact"]
     assert "other_rule" not in found
     assert found["recalibrated"]["n_calibration"] == calibration.calibration.n
-    indicative = "? indicative: frames of one recording are not independent draws"
-    assert table(found).count(indicative) == 1
+    lines = table(found)
+    assert sum(line.startswith("? indicative: frames of one recording") for line in lines) == 1
+    low, high = level["coverage_band_effective"]
+    assert low < level["coverage_band"][0]
+    (row,) = [line for line in lines if line.startswith("0.9     marginal")][1:]
+    assert f"{low:.3f}-{high:.3f}?" in row
 
 
 def test_the_command_line_takes_a_noise_and_refuses_it_on_unseen_data(
