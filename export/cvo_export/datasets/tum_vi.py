@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.trajectories.poses import matrix_to_pose, quaternion_pose
+from cvo_edge.trajectories.euroc import read_euroc
+from cvo_edge.trajectories.poses import matrix_to_pose
 from cvo_edge.trajectories.tables import read_rows
 from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
@@ -98,15 +99,10 @@ def _add_recording(
 
 def _read_track(folder: Path) -> Track:
     path = next((folder / each for each in _POSES if (folder / each).is_file()), folder / _POSES[0])
-    rows = read_rows(path, "timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z", separator=",", more=True)
-    if not rows:
-        raise SourceError(f"{path}: expected poses of the motion capture system, found none")
-    poses = []
-    for row in rows:
-        values = row.numbers(1)
-        pose = quaternion_pose(values[:3], np.roll(values[3:], -1))
-        poses.append(_INVALID if pose is None else pose)
-    return Track.of([row.nanoseconds() for row in rows], poses)
+    # The columns are EuRoC's, and here the body is the IMU.
+    trajectory = read_euroc(path, np.eye(4))
+    poses = [_INVALID if pose is None else pose for pose in trajectory.poses]
+    return Track.of(trajectory.keys, poses)
 
 
 def _read_camera(path: Path) -> tuple[Pinhole | None, NDArray[np.float64]]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cvo_edge import geometry
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.trajectories.poses import quaternion_pose
 from cvo_export.reconstruct.model import Model
 from cvo_export.reconstruct.recordings import frame_of, image_name
 from cvo_export.reconstruct.similarity import Similarity, between_poses
@@ -114,10 +115,11 @@ def read_known_poses(path: Path) -> dict[str, Array]:
         if not words or words[0].startswith("#"):
             continue
         try:
-            pose = np.array([float(word) for word in words[1:]])
+            numbers = np.array([float(word) for word in words[1:]])
         except ValueError:
-            pose = np.empty(0)
-        if pose.shape != (7,) or not np.isfinite(pose).all() or not _unit(pose[3:]):
+            numbers = np.empty(0)
+        pose = quaternion_pose(numbers[:3], numbers[3:]) if numbers.shape == (7,) else None
+        if pose is None:
             raise UsageError(
                 f"{path}:{number}: expected VIDEO/frame-NNNNNN tx ty tz qx qy qz qw with a unit "
                 f"quaternion, found {line.strip()}"
@@ -128,11 +130,7 @@ def read_known_poses(path: Path) -> dict[str, Array]:
             raise UsageError(f"{path}:{number}: {error}") from None
         if name in found:
             raise UsageError(f"{path}:{number}: expected each frame once, found {words[0]} again")
-        found[name] = np.concatenate([pose[:3], geometry.quaternion_normalise(pose[3:])])
+        found[name] = pose
     if len(found) < _FEWEST_POSES:
         raise UsageError(f"{path}: expected the poses of two or more frames, found {len(found)}")
     return found
-
-
-def _unit(quaternion: Array) -> bool:
-    return bool(abs(np.linalg.norm(quaternion) - 1.0) < 1e-2)
