@@ -78,7 +78,7 @@ def test_intrinsics_are_read_or_scaled_from_the_nominal_ones(tmp_path):
     with pytest.raises(SourceError, match="nine numbers"):
         open_seven_scenes(str(root))
     (root / "camera-intrinsics.txt").write_text("-50 0 31\n0 51 23\n0 0 1\n")
-    with pytest.raises(SourceError, match="expected finite intrinsics with positive focal"):
+    with pytest.raises(SourceError, match="expected a matrix of finite intrinsics with positive"):
         open_seven_scenes(str(root))
 
 

@@ -200,12 +200,7 @@ def _camera(bag: Bag, topic: str, images: str) -> tuple[Intrinsics, Lens] | None
     values = P[[0, 5, 2, 6]] if rectified else K[[0, 4, 2, 5]]
     if not values[:2].any():
         return None
-    intrinsics = Intrinsics(*values.tolist())
-    if not intrinsics.possible:
-        raise SourceError(
-            f"{bag.path}: expected in {topic} finite intrinsics with positive focal lengths, found "
-            f"{values.tolist()}"
-        )
+    intrinsics = Intrinsics(*values.tolist()).checked(f"{bag.path}: {topic}")
     if rectified or not D.any():
         return intrinsics, NO_DISTORTION
     model = _MODELS.get(info.distortion_model)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.camera import Camera, Distortion
+from cvo_edge.errors import SourceError
 from cvo_edge.pose import about
 from cvo_edge.trajectories.trajectory import Skipped
 
@@ -29,6 +30,15 @@ class Intrinsics(NamedTuple):
     def possible(self) -> bool:
         """Whether all numbers are finite and the focal lengths positive."""
         return bool(np.isfinite(self).all()) and self.fx > 0.0 and self.fy > 0.0
+
+    def checked(self, where: str) -> Intrinsics:
+        """Return the camera if it is possible; raises SourceError, which begins with ``where``."""
+        if not self.possible:
+            raise SourceError(
+                f"{where}: expected finite intrinsics with positive focal lengths, found "
+                f"{list(self)}"
+            )
+        return self
 
     def scaled(self, factor: float) -> Intrinsics:
         """Return the same camera for images ``factor`` times as large."""

@@ -19,6 +19,7 @@ from cvo_edge.input.image_files import frame_name, natural_key
 from cvo_edge.pose import Pose
 from cvo_edge.trajectories.poses import MATRIX_SUFFIX
 from cvo_export.datasets.base import Intrinsics, PoseDataset
+from cvo_export.datasets.camera_matrices import matrix_intrinsics, read_numbers
 from cvo_export.datasets.frames import FrameList
 
 # Files of a scene of 12-Scenes, whose frames have the same names.
@@ -103,13 +104,6 @@ def _intrinsics(root: Path, shape: tuple[int, ...]) -> Intrinsics:
     if not path.is_file():
         focal = _NOMINAL_FOCAL_PX * width / _NOMINAL_WIDTH
         return Intrinsics(focal, focal, width / 2, height / 2)
-    try:
-        K = np.array(path.read_text("ascii").split(), dtype=np.float64).reshape(3, 3)
-    except ValueError:
-        raise SourceError(f"{path}: expected the nine numbers of a 3x3 matrix") from None
-    found = Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    if not found.possible:
-        raise SourceError(
-            f"{path}: expected finite intrinsics with positive focal lengths, found {K.tolist()}"
-        )
-    return found
+    return matrix_intrinsics(
+        str(path), read_numbers(path, (9,), "the nine numbers of a 3x3 matrix")
+    )

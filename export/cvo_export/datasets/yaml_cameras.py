@@ -90,12 +90,7 @@ def pinhole(path: Path, camera: dict[Any, Any], lens: str) -> Pinhole | None:
         return None
     if camera.get("camera_model") != "pinhole":
         return None
-    found = Intrinsics(*intrinsics.tolist())
-    if not found.possible:
-        raise SourceError(
-            f"{path}: expected finite intrinsics with positive focal lengths, found "
-            f"{intrinsics.tolist()}"
-        )
+    found = Intrinsics(*intrinsics.tolist()).checked(str(path))
     resolution = _numbers(camera.get("resolution"), 2)
     size = None
     if resolution is not None and (resolution >= 1.0).all() and (resolution < _MOST_PX).all():
