@@ -61,10 +61,10 @@ def test_the_command_describes_a_data_set(tmp_path):
         "agreement   not compared with the poses: too few points can be followed from frame to "
         "frame",
         "sequence    desk: 1 frame, path 0.0 m",
-        f"split       random: {few} fit, val, cal, test among 1 frames in 1 sequence(s)",
+        f"split       random: {few} fit, val, cal, test among 1 frames in 1 sequence",
         "split       block (default): expected at least 60% of the frames to remain after gaps of "
         "3 frames, found 1 of 1; the recording is too short; --split random assigns single frames",
-        f"split       sequence: {few} fit, val, cal, test among 1 frames in 1 sequence(s)",
+        f"split       sequence: {few} fit, val, cal, test among 1 frames in 1 sequence",
     ]
     (folder / "rgb.txt").write_text("1.0\n")
     refused = cvo_export("dataset", f"tum:{folder}")

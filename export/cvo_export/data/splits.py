@@ -147,9 +147,10 @@ def make_split(
     roles = {role: frames[indices] for role, indices in roles.items()}
     empty = [role for role, indices in roles.items() if indices.size == 0]
     if empty:
+        recordings = np.unique(dealt.sequence).size
         raise UsageError(
             f"split {kind}: expected frames for every role, found none for {', '.join(empty)} "
-            f"among {frames.size} frames in {np.unique(dealt.sequence).size} sequence(s)"
+            f"among {frames.size} frames in {recordings} sequence{'s' * (recordings != 1)}"
         )
     return Split(kind, seed, purpose, roles, blocks)
 
