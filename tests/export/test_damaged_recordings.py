@@ -7,8 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from cvo_edge.errors import SourceError
+from cvo_edge.errors import SourceError, UsageError
 from cvo_export.datasets import FORMATS, open_dataset
+from cvo_export.datasets.describe import describe
+from cvo_export.datasets.sizes import one_size
+from cvo_export.training.loop import train
+
+from .conftest import ignore_progress, tiny_config
 
 
 @pytest.fixture
@@ -104,3 +109,27 @@ def test_a_sensor_s_camera_is_that_of_resized_images(tmp_path, size, focal):
             open_dataset(f"euroc:{tmp_path}")
     else:
         assert open_dataset(f"euroc:{tmp_path}").intrinsics.fx == focal
+
+
+def test_damaged_and_tiny_images_are_refused_before_training(tmp_path):
+    for number in range(3):
+        (tmp_path / f"frame-{number}.pose.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
+        cv2.imwrite(str(tmp_path / f"frame-{number}.color.png"), np.full((8, 8), 90, np.uint8))
+    with pytest.raises(SourceError, match=r"at least 16 px per side, found 8x8 \(3\)"):
+        one_size(open_dataset(f"7scenes:{tmp_path}"))
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"frame-{number}.color.png"), np.full((48, 64), 90, np.uint8))
+    (tmp_path / "frame-1.color.png").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"found 1 damaged of 3, the first .*frame-1;"):
+        one_size(open_dataset(f"7scenes:{tmp_path}"))
+    assert "1 damaged image" in "\n".join(describe(open_dataset(f"7scenes:{tmp_path}")))
+
+
+def test_a_camera_that_never_moves_is_refused_before_training(tmp_path):
+    for number in range(100):
+        (tmp_path / f"frame-{number}.pose.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
+        cv2.imwrite(str(tmp_path / f"frame-{number}.color.png"), np.full((48, 64), 90, np.uint8))
+    config = tiny_config(dataset=f"7scenes:{tmp_path}")
+    with pytest.raises(UsageError, match="expected a camera that moves"):
+        train(tmp_path / "run", config, ignore_progress)
+    assert not (tmp_path / "run").exists()

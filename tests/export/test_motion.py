@@ -119,6 +119,13 @@ def test_images_of_other_poses_do_not_belong_to_them():
     assert "do not belong together" in told or "world-to-camera" in told
 
 
+@pytest.mark.parametrize("far", [0.0, 5e6])
+def test_poses_that_are_all_the_same_are_no_other_reading(far):
+    same = np.tile(WALK.poses[:1], (FRAMES, 1)) + np.array([far, far, 0, 0, 0, 0, 0])
+    (told,) = _told(replace(WALK, poses=same))
+    assert "do not belong together" in told
+
+
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_up_turns_with_the_world(axis, sign):

@@ -31,6 +31,8 @@ _POINTS, _LEAST_POINTS, _LEAST_PAIRS = 200, 30, 4
 _WIDTH, _OFF_PX = 480, 1.0
 # Parallax from which a point's depth counts, pixels.
 _PARALLAX_PX = 2.0
+# Rounding moves a camera at coordinates of 1e7 m by less than this, in the poses' unit.
+_LEAST_BASELINE = 1e-6
 # Focal lengths that are tried if the camera is not stated, as shares of the width.
 _FOCAL = (0.6, 0.75, 0.9, 1.1)
 # A reading that fits this share of points, and twice as many as the poses as read, is right.
@@ -214,7 +216,10 @@ def _fit(T: Array, first: Array, second: Array, focal_px: float) -> tuple[NDArra
     A depth is NaN where there is little parallax.
     """
     R, t = T[:3, :3], T[:3, 3]
-    length = max(float(np.linalg.norm(t)), 1e-12)
+    length = float(np.linalg.norm(t))
+    # Poses that are equal but for rounding give no direction of motion, which anything would fit.
+    moved = length > _LEAST_BASELINE
+    length = max(length, _LEAST_BASELINE)
     turned = first @ R.T
     ahead = turned[:, 2] > 0.0
     flow = np.full(len(first), np.inf)
@@ -231,8 +236,8 @@ def _fit(T: Array, first: Array, second: Array, focal_px: float) -> tuple[NDArra
     line, back = first @ (cross @ R).T, second @ (cross @ R)
     squared = (line[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
     off = focal_px * np.abs((second * line).sum(axis=1)) / np.sqrt(squared + 1e-30)
-    fit = (flow < _OFF_PX) | ((off < _OFF_PX) & (depth > 0.0) & (other > 0.0))
-    return fit, np.where(flow > _PARALLAX_PX, depth, np.nan)
+    fit = (flow < _OFF_PX) | (moved & (off < _OFF_PX) & (depth > 0.0) & (other > 0.0))
+    return fit, np.where(moved & (flow > _PARALLAX_PX), depth, np.nan)
 
 
 def _products(a: Array, b: Array) -> tuple[tuple[Array, Array], ...]:

@@ -39,6 +39,8 @@ def describe(dataset: PoseDataset) -> list[str]:
     height, width = dataset.read_image(0).shape[:2]
     sizes = image_sizes(dataset)
     mixed = f"; of several sizes: {sizes_text(sizes)}" if len(sizes) > 1 else ""
+    if dataset.image_size is not None and (damaged := len(dataset) - sizes.total()):
+        mixed += f"; {_counted(damaged, 'damaged image')}, training refuses them"
     camera = "not stated"
     if dataset.intrinsics is not None:
         numbers = dataset.intrinsics._asdict()
@@ -113,6 +115,9 @@ def _moves(dataset: PoseDataset, motion: Motion) -> list[str]:
             "baselines cannot be trained"
         )
     names = [name for name, rests in zip(get_args(StillDof), motion.still, strict=True) if rests]
+    told = "learned with a floor as unit, scores leave them out"
+    if motion.still.all():
+        told = "there is nothing to learn, and training refuses that"
     return [
         f"extent      {extent} m, path {motion.metres.sum():.1f} m",
         *(
@@ -121,14 +126,7 @@ def _moves(dataset: PoseDataset, motion: Motion) -> list[str]:
             else []
         ),
         f"turns       up to {motion.spread_rad:.2f} rad from the mean rotation{wide}",
-        *(
-            [
-                f"still       {' '.join(names)} hardly move: learned with a floor as unit, "
-                "scores leave them out"
-            ]
-            if names
-            else []
-        ),
+        *([f"still       {' '.join(names)} hardly move: {told}"] if names else []),
         f"up          {_up_text(dataset.poses)}",
     ]
 

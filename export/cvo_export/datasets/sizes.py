@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 
-from cvo_edge.camera import Camera
+from cvo_edge.camera import LEAST_SIDE, Camera
 from cvo_edge.errors import SourceError
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 
@@ -28,7 +28,7 @@ def image_sizes(dataset: PoseDataset) -> Counter[Size]:
 def one_size(dataset: PoseDataset) -> Size:
     """Return width and height of all images of a data set.
 
-    Raises SourceError if they have several sizes, or if no image can be read.
+    Raises SourceError if they have several sizes, or one too small, or if an image is damaged.
     """
     sizes = image_sizes(dataset)
     if len(sizes) != 1:
@@ -37,6 +37,17 @@ def one_size(dataset: PoseDataset) -> Size:
             + ("; leave the others out, or resize those of the same camera" if sizes else "")
         )
     (size,) = sizes
+    if min(size) < LEAST_SIDE:
+        raise SourceError(
+            f"{dataset.name}: expected images of at least {LEAST_SIDE} px per side, found "
+            f"{sizes_text(sizes)}"
+        )
+    if dataset.image_size is not None and (damaged := len(dataset) - sizes.total()):
+        names = (n for i, n in enumerate(dataset.frame_names) if dataset.image_size(i) is None)
+        raise SourceError(
+            f"{dataset.name}: expected readable images, found {damaged} damaged of {len(dataset)}, "
+            f"the first {next(names, '')}; delete them"
+        )
     return size
 
 

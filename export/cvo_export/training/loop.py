@@ -84,6 +84,11 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     poses = dataset.local_poses
     target = fit_target(poses[indices], poses)
     _check_turns(config, target)
+    if len(target.still_dof) == 6:
+        raise UsageError(
+            f"{dataset.name}: expected a camera that moves, found hardly a change of the pose in "
+            f"{indices.size} training frames"
+        )
     claim_run(run_dir, config, dataset, split)
     size = (config.height, config.width, config.crop)
     images = ModelImages(dataset, indices, *size)
