@@ -62,7 +62,6 @@ CASES: dict[str, tuple[str, str | None]] = {
     "room-planar": (f"{ROOM},turn=1,still=z+pitch+roll", "room-full-turn"),
     "room-never-turns": (f"{ROOM},still=yaw+pitch+roll", "room"),
     "street": ("synthetic:street,drives=24,frames=80", None),
-    "street-block": ("synthetic:street,drives=1,frames=1000", "street"),
 }
 
 
