@@ -241,6 +241,7 @@ def test_sequences_and_states_are_refused_with_a_way_out(inputs, named):
         ("range=0-1", [], "16x20", "--output: expected pose, or translation and rotation"),
         ("range=2", ["pose=out"], "16x20", "--input: expected range= one of 0-1, 0-255, found 2"),
         ("range=0-1,mean=a", ["pose=out"], "16x20", "--input: expected mean= one number or"),
+        ("range=0-1,std=inf", ["pose=out"], "16x20", "--input: expected std= one number or"),
         ("range=0-1", ["pose=out"], "16", "--size: expected HEIGHTxWIDTH such as 224x320"),
     ],
 )

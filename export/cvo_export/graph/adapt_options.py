@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -126,6 +127,8 @@ def _numbers(key: str, text: str) -> tuple[float, ...]:
     try:
         numbers = tuple(float(part) for part in text.split("/"))
     except ValueError:
+        numbers = ()
+    if not all(map(math.isfinite, numbers)):
         numbers = ()
     if len(numbers) not in (1, 3) or (key == "std" and not all(n > 0 for n in numbers)):
         raise UsageError(
