@@ -16,6 +16,7 @@ from cvo_export.bundles.choice import with_difficulty
 from cvo_export.bundles.difficulty import degraded
 from cvo_export.bundles.draft import Draft
 from cvo_export.bundles.observed import Observed
+from cvo_export.bundles.refused import Refused
 from cvo_export.data.noise import KINDS
 from cvo_export.datasets import PoseDataset, open_dataset
 
@@ -44,8 +45,7 @@ def seen(generator, count, novelty, slopes=SLOPES):
         sequence=np.zeros(count, np.int64),
         coloured=np.ones(count, bool),
         size=(64, 48),
-        invalid=0,
-        degraded=0,
+        refused=Refused(),
         judged=None,
     )
 

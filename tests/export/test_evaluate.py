@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from cvo_edge import Odometer
 from cvo_edge.errors import CvoError, GateError, SourceError, UsageError
@@ -190,21 +191,26 @@ PROVEN = (
 MEASURED = "coverage of a calibration recording left out, at 0.9: marginal "
 
 
+def in_process(*arguments):
+    """Run a command here: torch is loaded already."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
 def test_the_command_line_trains_publishes_and_evaluates(tmp_path):
     run, bundle = tmp_path / "run", tmp_path / "bundle"
-    trained = cvo_export(
+    trained = in_process(
         *("train", "cjp", DATASET, run, "--split", "sequence", "--weights", "none"),
         *("--backbone", "test_efficientnet", "--size", "64x48", "--copies", 1, "--steps", 100),
     )
-    assert trained.returncode == 0, trained.stderr
+    assert trained.exit_code == 0, trained.stderr
     assert trained.stdout == ""
     assert trained.stderr.startswith("synthetic-room 320 frames in 8 sequences; none skipped\n")
     assert "best        val score" in trained.stderr
-    published = cvo_export("publish", run, bundle)
-    assert published.returncode == 0, published.stderr
+    published = in_process("publish", run, bundle)
+    assert published.exit_code == 0, published.stderr
     assert "(seed 0), capped at 0.5" in " ".join(published.stdout.split())
-    evaluated = cvo_export("evaluate", bundle, DATASET, "--json", tmp_path / "report.json")
-    assert evaluated.returncode == 0, evaluated.stderr
+    evaluated = in_process("evaluate", bundle, DATASET, "--json", tmp_path / "report.json")
+    assert evaluated.exit_code == 0, evaluated.stderr
     assert "pooled rule" in evaluated.stdout
     found = json.loads((tmp_path / "report.json").read_text())
     assert found["other_rule"]["rule"] == "pooled"

@@ -283,7 +283,7 @@ def test_a_damaged_image_costs_that_frame_only(tiny_bundle, tiny_run):
     with Odometer.load(tiny_bundle) as odometer:
         seen = observe(odometer, holed, np.arange(3))
     assert seen.indices.tolist() == [0, 2]
-    assert (seen.invalid, seen.degraded) == (1, 0)
+    assert (seen.refused.invalid, seen.refused.degraded) == (1, 0)
 
 
 def test_a_frame_that_nothing_may_be_claimed_of_is_not_calibrated_with(tiny_bundle, tiny_run):
@@ -295,7 +295,7 @@ def test_a_frame_that_nothing_may_be_claimed_of_is_not_calibrated_with(tiny_bund
     with Odometer.load(tiny_bundle) as odometer:
         seen = observe(odometer, holed, np.arange(3))
     assert seen.indices.tolist() == [0, 2]
-    assert (seen.invalid, seen.degraded) == (0, 1)
+    assert (seen.refused.invalid, seen.refused.degraded) == (0, 1)
 
 
 def test_no_frame_that_passes_is_a_usage_error(tiny_bundle, tiny_run):

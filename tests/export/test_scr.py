@@ -292,7 +292,7 @@ def test_spread_poses_cover_all_poses():
 
 def test_a_network_that_recognises_nothing_is_not_published(runs, tmp_path):
     _, run, _ = runs("scr")
-    with pytest.raises(SourceError, match=r"found none of \d+: image_unfamiliar \d+$"):
+    with pytest.raises(SourceError, match=r"found none of \d+: image_unfamiliar \d+ \("):
         publish(run, tmp_path / "bundle", "lost")
     assert not (tmp_path / "bundle").exists()
 
