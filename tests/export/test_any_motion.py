@@ -27,7 +27,9 @@ _FEW = "synthetic:room,flights=6,frames=30,size=64x48,turn=1,still=z+pitch+roll"
 
 
 def _bundle(folder: Path, head: Any) -> Path:
-    run = train(folder / "run", tiny_config(dataset=_ROBOT, head=head, copies=1, steps=120), ignore_progress)
+    run = train(
+        folder / "run", tiny_config(dataset=_ROBOT, head=head, copies=1, steps=120), ignore_progress
+    )
     assert run.target.turns
     publish(run, folder / "bundle", "robot")
     return folder / "bundle"
