@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.onnx._internal.exporter import _registration
 
 from cvo_export import publish as publishing
 from cvo_export.bundles import alarm, difficulty
@@ -74,7 +76,10 @@ def _exported_once() -> Iterator[None]:
             graphs[key] = to_onnx.export_onnx(module, *rest)
         return graphs[key]
 
+    # torch parses its five hundred operators again for each export.
+    operators = functools.cache(_registration.onnxscript_apis.get_torchlib_ops)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_registration.onnxscript_apis, "get_torchlib_ops", operators)
         patch.setattr(features, "export_onnx", export_once)
         patch.setattr(publishing, "export_onnx", export_once)
         yield

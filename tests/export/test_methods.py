@@ -60,7 +60,7 @@ def runs(tmp_path_factory):
     def of(method):
         if method not in made:
             folder = tmp_path_factory.mktemp("runs") / method
-            config = tiny_config(head=CONFIGS[method])
+            config = tiny_config(head=CONFIGS[method], steps=120)
             run = train(folder, config, ignore_progress)
             bundle = folder.with_name(method + "-bundle")
             publish(run, bundle, method)
@@ -89,9 +89,11 @@ def test_an_interrupted_run_ends_as_if_it_never_was(runs, method, tmp_path):
     calls = {"cqr": 50, "csp": 25, "mcqr": 170}[method]
     with pytest.raises(InterruptedTrainingError):
         train(
-            tmp_path / "run", tiny_config(head=CONFIGS[method]), stopping_after(calls, "training")
+            tmp_path / "run",
+            tiny_config(head=CONFIGS[method], steps=120),
+            stopping_after(calls, "training"),
         )
-    resumed = train(tmp_path / "run", tiny_config(head=CONFIGS[method]), ignore_progress)
+    resumed = train(tmp_path / "run", tiny_config(head=CONFIGS[method], steps=120), ignore_progress)
     assert same_weights(run, resumed)
     assert run.history == resumed.history
 
