@@ -372,7 +372,7 @@ def test_thresholds_fit_the_counts_that_made_them_and_no_others(artifacts_dir, s
     head = CqrHead(base.parameters(CqrParameters), "normalised")
     number = len(head.side_confidences(0.9))
     made = {}
-    for n in (1, 9, 11, 19, 40, 119, 599):
+    for n in (1, 9, 11, 19, 40, 60, 119, 599, 600):
         scores = np.random.default_rng(n).uniform(0.5, 3.0, (n, number, 6))
         scored = exporter.Scored(scores, scores, np.arange(n))
         entries = exporter.thresholds(head, scored, scored, rule, joint)
