@@ -30,6 +30,7 @@ from cvo_edge.input.image_files import (
     images_in,
     stamp_at,
 )
+from cvo_edge.input.stamps import NAMES, ListedStamps
 
 # Videos whose first bytes are those of an image.
 _JPEGS_IN_A_ROW = (".mjpg", ".mjpeg")
@@ -66,8 +67,8 @@ def open_source(
     timeout_s
         Longest wait for the next frame of a video or camera; opening may take twice as long.
     stamps
-        Where the stamps of image files are: ``names``, or a file such as ``rgb.txt``, ``data.csv``
-        or ``times.txt`` (see ``cvo_edge.input.stamps``).
+        Where the stamps are: ``names`` of image files, or a file such as ``rgb.txt``, ``data.csv``
+        or ``times.txt``, also for a video (see ``cvo_edge.input.stamps``).
 
     Raises
     ------
@@ -75,7 +76,7 @@ def open_source(
         There is no such source, or it holds no image.
     UsageError
         ``source`` is of another type, ``fps`` or ``timeout_s`` is out of range, or ``stamps`` is
-        given with ``fps`` or without image files.
+        given with ``fps``, for a camera, or as ``names`` for a video.
     """
     text = _text(source)
     if fps is not None and not LOWEST_FPS <= fps <= HIGHEST_FPS:
@@ -94,13 +95,22 @@ def open_source(
     if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
         raise SourceError(f"{shown(text)}: expected a file's path, found a file address")
     if names_camera(text):
-        _refuse_stamps(stamps, text)
+        if stamps is not None:
+            raise UsageError(
+                f"stamps: expected images or a video, whose stamps they are, found {shown(text)}, "
+                "whose frames are stamped as they arrive"
+            )
         return Camera(int(text) if text.isdecimal() else text, fps, timeout_s)
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES or _is_one_image(path):
             return ImageFiles(Listing([path], {}), fps, "", stamps)
-        _refuse_stamps(stamps, text)
-        return Video(path, fps, timeout_s)
+        if stamps == NAMES:
+            raise UsageError(
+                f"stamps: expected a list of times for a video, found {NAMES}, which are those of "
+                "image files"
+            )
+        listed = None if stamps is None else ListedStamps(Path(stamps))
+        return Video(path, fps, timeout_s, listed)
     if glob.has_magic(text):
         found = [Path(name) for name in glob.glob(text, recursive=True) if Path(name).is_file()]
         return ImageFiles(
@@ -110,14 +120,6 @@ def open_source(
         f"{shown(text)}: not found; expected a folder, glob, video file, camera index, device or "
         "address"
     )
-
-
-def _refuse_stamps(stamps: str | None, text: str) -> None:
-    if stamps is not None:
-        raise UsageError(
-            f"stamps: expected a folder of images, whose stamps they are, found {shown(text)}, "
-            "which has its own"
-        )
 
 
 def _text(source: str | os.PathLike[str] | int) -> str:
@@ -139,7 +141,7 @@ def names_camera(text: str) -> bool:
 
 
 class Video:
-    """A video file. Stamps are its container's, from the first frame on, unless ``fps`` is given.
+    """A video file. Stamps are its container's, from the first frame on, unless others are given.
 
     A frame that does not decode has no image if a later one decodes; else the video ends there.
     """
@@ -149,13 +151,22 @@ class Video:
     # So many in a row are the end, also if the container announces no number of frames.
     _UNREADABLE_IN_A_ROW = 100
 
-    def __init__(self, path: Path, fps: float | None, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(
+        self,
+        path: Path,
+        fps: float | None,
+        timeout_s: float = TIMEOUT_S,
+        stamps: ListedStamps | None = None,
+    ) -> None:
         check_video(path)
         self._path = path
         self._capture = Capture(str(path), timeout_s)
         own_fps, announced = self._capture.open()
-        self._stamps = _VideoStamps(fps, own_fps)
         self.length: int | None = announced if announced > 0 else None
+        self._listed = stamps
+        if stamps is not None:
+            stamps.check(self.length)
+        self._stamps = stamps or _VideoStamps(fps, own_fps)
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield the frames; each is read before its call is yielded."""
@@ -163,7 +174,10 @@ class Video:
             yield partial(_itself, frame)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames; raises SourceError if the file ends before its own count."""
+        """Yield the frames.
+
+        Raises SourceError if the file ends before its own count, or does not fit listed stamps.
+        """
         seq = unreadable = 0
         with closing(self._capture):
             while unreadable < self._UNREADABLE_IN_A_ROW:
@@ -183,6 +197,8 @@ class Video:
                 f"{self._path}: ended early: {seq} of {self.length} frames (by its header or "
                 "duration); copy or record it again"
             )
+        if self._listed is not None:
+            self._listed.end()
 
 
 class _VideoStamps:

@@ -1,4 +1,4 @@
-"""Stamps of image files: from their names, or from a list.
+"""Stamps of frames: from the names of image files, or from a list.
 
 ===================================  ====================================  ====================
 given                                stamps                                belong to
@@ -6,11 +6,14 @@ given                                stamps                                belon
 ``names``                            the number at the end of each name    the file
 lines ``timestamp file`` (rgb.txt)   seconds                               files of that name
 lines ``timestamp,file`` (data.csv)  integer nanoseconds                   files of that name
+lines ``timestamp frame``            seconds                               frames of a video
+lines ``timestamp,frame``            integer nanoseconds                   frames of a video
 one number a line (times.txt)        seconds                               line i: frame i
 ===================================  ====================================  ====================
 
-A number with a point is seconds. Integers since 1970 have 10 digits in seconds, 13 in milliseconds,
-16 in microseconds and 19 in nanoseconds; others are not taken as stamps.
+Frames of a video are numbered from 0. A number with a point is seconds. Integers since 1970 have 10
+digits in seconds, 13 in milliseconds, 16 in microseconds and 19 in nanoseconds; others are not
+taken as stamps.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from cvo_edge.errors import SourceError
-from cvo_edge.trajectories.tables import first_line, read_rows, read_text, seconds_to_ns
+from cvo_edge.trajectories.tables import Row, first_line, read_rows, read_text, seconds_to_ns
 
 NAMES = "names"
 
@@ -29,7 +32,9 @@ _AT_END = re.compile(r"(?:^|[^0-9.])([0-9]+(?:\.[0-9]+)?)$")
 _UNITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
 # A number with fewer digits before the point may be anything, unless stamps were asked for.
 _CERTAIN, _MOST = 9, 11
+_LONGEST_NUMBER = 10
 _FORM = "stamps: timestamp file, timestamp,file or a time a line"
+_VIDEO_FORM = "stamps of a video: a time a line, timestamp frame or timestamp,frame"
 
 
 def stamps_in_names(names: Sequence[str]) -> list[int] | None:
@@ -62,13 +67,95 @@ def read_stamps(given: str, names: Sequence[str], files: Sequence[str]) -> list[
         stamps = [_needed(_stamp(name, 1), file) for name, file in zip(names, files, strict=True)]
     else:
         stamps = _listed(Path(given), names, files)
+    _check_rising(stamps, files)
+    return stamps
+
+
+def _check_rising(stamps: Sequence[int], frames: Sequence[str]) -> None:
     for place, (first, second) in enumerate(pairwise(stamps)):
         if second <= first:
             raise SourceError(
                 f"stamps: expected each later than the one before, found {_seconds(first)} for "
-                f"{files[place]} and {_seconds(second)} for {files[place + 1]}"
+                f"{frames[place]} and {_seconds(second)} for {frames[place + 1]}"
             )
-    return stamps
+
+
+class ListedStamps:
+    """Stamps of a video's frames, from a list.
+
+    The number of frames is certain only at the end of a video, as its container may announce none
+    or another one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read a list of times, or of times and frame numbers.
+
+        Raises SourceError if a line is malformed, or a stamp is not later than the one before.
+        """
+        _, line = first_line(read_text(path, _VIDEO_FORM))
+        if not line:
+            raise SourceError(f"{path}: expected {_VIDEO_FORM}, found no line")
+        self._path = path
+        self._numbered = "," in line or len(line.split()) > 1
+        if "," in line:
+            rows = read_rows(path, "timestamp [ns],frame", separator=",", more=True)
+            listed = [(_number(row), row.nanoseconds()) for row in rows]
+        elif self._numbered:
+            rows = read_rows(path, "timestamp frame", more=True)
+            listed = [(_number(row), row.seconds()) for row in rows]
+        else:
+            listed = list(enumerate(row.seconds() for row in read_rows(path, "time")))
+        # Of a frame that is listed twice, the first stamp counts.
+        self._stamps_ns = dict(sorted(dict(reversed(listed)).items()))
+        _check_rising(list(self._stamps_ns.values()), [f"frame {n}" for n in self._stamps_ns])
+        self._seq = 0
+
+    def check(self, announced: int | None) -> None:
+        """Raise SourceError if a frame has no stamp, of those that the container announces."""
+        missing = (seq for seq in range(announced or 0) if seq not in self._stamps_ns)
+        if (seq := next(missing, None)) is not None:
+            raise self._refusal(
+                f"{announced} frames, as the video announces",
+                self._none_for(seq)
+                or "; if it holds fewer, ffmpeg -i VIDEO -c copy NEW.mp4 corrects its number",
+            )
+
+    def next(self, count: int, position_ms: float) -> list[int]:  # noqa: ARG002 - one protocol
+        """Return the stamps of the next ``count`` frames, wherever they are in the container.
+
+        Raises SourceError if a frame has none.
+        """
+        begin, self._seq = self._seq, self._seq + count
+        for seq in range(begin, self._seq):
+            if seq not in self._stamps_ns:
+                raise self._refusal(f"{seq + 1} frames or more", self._none_for(seq))
+        return [self._stamps_ns[seq] for seq in range(begin, self._seq)]
+
+    def end(self) -> None:
+        """Raise SourceError if a list of times without numbers is longer than the video."""
+        if not self._numbered and self._seq < len(self._stamps_ns):
+            raise self._refusal(
+                f"{self._seq} frames, the whole video",
+                "; times of dropped frames shift those after them: delete them, or write lines "
+                "timestamp frame",
+            )
+
+    def _none_for(self, seq: int) -> str:
+        return f", none for frame {seq}; frames count from 0" if self._numbered else ""
+
+    def _refusal(self, frames: str, more: str) -> SourceError:
+        count = len(self._stamps_ns)
+        return SourceError(
+            f"{self._path}: expected a stamp for each of {frames}, found {count}{more}"
+        )
+
+
+def _number(row: Row) -> int:
+    """Return the second column, the number of a frame; raises SourceError."""
+    digits = row.fields[1]
+    if not (digits.isascii() and digits.isdecimal() and len(digits) <= _LONGEST_NUMBER):
+        raise row.refusal()
+    return int(digits)
 
 
 def _listed(path: Path, names: Sequence[str], files: Sequence[str]) -> list[int]:

@@ -65,8 +65,8 @@ StampsOption = Annotated[
     typer.Option(
         "--stamps",
         metavar="<names|FILE>",
-        help="Where the stamps of images are: in their names, or in rgb.txt, data.csv or "
-        "times.txt.",
+        help="Where the stamps are: in the names of images, or in a list such as rgb.txt, data.csv "
+        "or times.txt; for a video, a time a line or lines timestamp frame.",
         show_default=False,
         rich_help_panel="Input",
     ),

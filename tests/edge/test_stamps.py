@@ -1,4 +1,4 @@
-"""Stamps of image files: in names and lists; what is no stamp, and what does not belong."""
+"""Stamps of frames: in names and lists; what is no stamp, and what does not belong."""
 
 import cv2
 import numpy as np
@@ -87,8 +87,80 @@ def test_frames_without_numbers_take_times_in_their_order(tmp_path):
         stamps_of(folder, path)
 
 
-def test_stamps_are_for_image_files_alone(tmp_path):
-    with pytest.raises(UsageError, match="expected a folder of images"):
-        open_source("0", stamps="names")
+@pytest.fixture
+def video(tmp_path):
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no video")
+    for value in (30, 90, 150):
+        writer.write(np.full((48, 64, 3), value, np.uint8))
+    writer.release()
+    return path
+
+
+def announce(video, count):
+    """Change the number of frames in the header of an AVI file."""
+    content = bytearray(video.read_bytes())
+    for place in (content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32):
+        content[place : place + 4] = count.to_bytes(4, "little")
+    video.write_bytes(content)
+
+
+SHORT = "expected a stamp for each of 3 frames, as the video announces, found"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("# s\n0.5\n7.5e-1\n1\n", [500_000_000, 750_000_000, 10**9]),
+        (f"{NS},0\n{NS + 5},1\n{NS + 9},2\n{NS + 10},3\n", [NS, NS + 5, NS + 9]),
+        ("0.3 2\n0.1 0\n\n0.2 1 x\n0.9 1\n", [100_000_000, 200_000_000, 300_000_000]),
+        ("0.5\n0.75\n", f"{SHORT} 2; if it holds fewer, ffmpeg"),
+        ("0.1 1\n0.2 2\n0.3 3\n", f"{SHORT} 3, none for frame 0; frames count from 0$"),
+        ("0.5\n0.75\n0.75\n", "found 0.750000000 s for frame 1 and 0.750000000 s for frame 2"),
+        ("0.1 0\n0.3 1\n0.2 2\n", "found 0.300000000 s for frame 1 and 0.200000000 s for frame 2"),
+        ("0.1 rgb/1.png\n", "expected timestamp frame, found '0.1 rgb/1.png' in line 1"),
+        ("0.1,0\n", r"expected timestamp \[ns\],frame, found '0.1 0' in line 1"),
+        ("timestamp frame\n0.1 0\n", "put # before a line of names"),
+        ("# a\n", "expected stamps of a video: .*, found no line"),
+    ],
+)
+def test_lists_of_stamps_of_a_video(tmp_path, video, text, expected):
+    path = tmp_path / "times.txt"
+    path.write_text(text)
+    if isinstance(expected, list):
+        assert stamps_of(video, path) == expected
+    else:
+        with pytest.raises(SourceError, match=expected):
+            open_source(video, stamps=str(path))
+
+
+@pytest.mark.parametrize(
+    ("announced", "text", "seen", "expected"),
+    [
+        (0, "0.5\n0.75\n", 2, "each of 3 frames or more, found 2$"),
+        (2, "0.1 0\n0.2 1\n0.4 3\n", 2, "found 3, none for frame 2; frames count"),
+        (3, "1\n2\n3\n4\n", 3, "each of 3 frames, the whole video, found 4; times of dropped"),
+        (4, "1\n2\n3\n4\n", 3, "ended early: 3 of 4 frames"),
+    ],
+)
+def test_what_a_video_does_not_announce_is_refused_after_its_frames(
+    tmp_path, video, announced, text, seen, expected
+):
+    announce(video, announced)
+    path = tmp_path / "times.txt"
+    path.write_text(text)
+    found = []
+    with pytest.raises(SourceError, match=expected):
+        found.extend(open_source(video, stamps=str(path)))
+    assert len(found) == seen
+
+
+def test_stamps_are_for_recordings_alone(tmp_path, video):
+    with pytest.raises(UsageError, match=r"expected images or a video, .* found 0, whose frames"):
+        open_source("0", stamps="times.txt")
+    with pytest.raises(UsageError, match="expected a list of times for a video, found names"):
+        open_source(video, stamps="names")
     with pytest.raises(UsageError, match="expected no fps beside them"):
         open_source(folder_of(tmp_path, ["1.png"]), 30.0, stamps="names")
