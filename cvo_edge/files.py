@@ -1,4 +1,4 @@
-"""Bounded reading of untrusted files, atomic writing, and the folders for cache and state."""
+"""Bounded reading of untrusted files, atomic writing, folders for cache and state, and order."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import errno
 import glob
 import io
 import os
+import re
 import stat
 import sys
 from collections.abc import Iterator
@@ -198,3 +199,13 @@ def refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
         files = [name, *glob.iglob(name, recursive=True), *glob.iglob(f"{glob.escape(name)}/*")]
         if any(os.path.exists(file) and written.samefile(file) for file in files):  # noqa: PTH110
             raise UsageError(f"output: expected a new file, found {output} among the inputs")
+
+
+def natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key that compares digits as numbers: ``frame-2`` before ``frame-10``."""
+    parts = re.split("([0-9]+)", str(path))
+    return [
+        (1, 0, part) if index % 2 == 0 else (0, int(part), "")
+        for index, part in enumerate(parts)
+        if part
+    ]

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.estimate import PoseInterval
-from cvo_edge.ground_truth.detect import Found, find_trajectory
+from cvo_edge.ground_truth.detect import find_poses
+from cvo_edge.ground_truth.found import Found, Key
 from cvo_edge.input.image_files import frame_name
-from cvo_edge.trajectories.trajectory import Skipped, nearest_stamp
+from cvo_edge.trajectories.trajectory import Skipped
 
 Array = NDArray[np.float64]
-Key = int | str
 
 # Digits of a frame's number; longer names are stamps.
 _LONGEST = 10
@@ -31,14 +30,7 @@ class GroundTruth:
     def pose_of(self, estimate: PoseInterval) -> Array | None:
         """Return the true ``T_world_camera`` (7,) of an estimate's frame, or None."""
         key = self.key_of(estimate)
-        if key is None:
-            return None
-        trajectory = self.found.trajectory
-        if self.found.by == "stamp":
-            index = nearest_stamp(trajectory.keys, int(key), self.found.bound_ns)
-        else:
-            index = self._index.get(key)
-        return None if index is None else trajectory.poses[index]
+        return None if key is None else self.found.at(key)
 
     def key_of(self, estimate: PoseInterval) -> Key | None:
         """Return what a pose must have in common with an estimate's frame; None if it is unknown.
@@ -56,15 +48,14 @@ class GroundTruth:
     @property
     def skipped(self) -> Skipped:
         """What the file holds without giving a pose."""
-        return self.found.trajectory.skipped
+        return self.found.skipped
 
     def spans(self, first: Key | None, last: Key | None) -> str:
         """Return the keys of frames, given the first and the last one, beside those of the poses.
 
         None means that the frames have no keys.
         """
-        keys = self.found.trajectory.keys
-        poses = f"poses {self._span(keys[0], keys[-1])}"
+        poses = f"poses {self._span(self.found.first, self.found.last)}"
         if first is None or last is None:
             return f"frames without a stamp, {poses}; --stamps or --fps stamps frames"
         return f"frames {self._span(first, last)}, {poses}"
@@ -73,10 +64,6 @@ class GroundTruth:
         if self.found.by == "stamp":
             return f"at {int(first) / 1e9:.3f} .. {int(last) / 1e9:.3f} s"
         return f"{first} .. {last}"
-
-    @cached_property
-    def _index(self) -> dict[Key, int]:
-        return {key: index for index, key in enumerate(self.found.trajectory.keys)}
 
 
 def open_ground_truth(path: Path, source: str | os.PathLike[str] = "") -> GroundTruth:
@@ -87,12 +74,13 @@ def open_ground_truth(path: Path, source: str | os.PathLike[str] = "") -> Ground
     path
         File or folder.
     source
-        Folder, glob or file of the frames, whose place in the recordings of KITTI and EuRoC says
-        which camera's poses are wanted.
+        Folder, glob or file of the frames, whose place in a recording says which camera's or which
+        part's poses are wanted.
 
     Raises SourceError if the format is unknown, a file is malformed, what leads to the camera is
     missing, or no pose is valid.
     """
-    given = Path(source)
+    # The names of the folders above count, also of `.`.
+    given = Path(source).absolute()
     folder = os.path.isdir(source)  # noqa: PTH112 - also of a name too long
-    return GroundTruth(find_trajectory(path, given if folder else given.parent))
+    return GroundTruth(find_poses(path, given if folder else given.parent))

@@ -11,7 +11,7 @@ from time import perf_counter
 from typing import NamedTuple
 
 from cvo_edge.errors import SourceError
-from cvo_edge.files import read_regular_file
+from cvo_edge.files import natural_key, read_regular_file
 from cvo_edge.input.capture import shown
 from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image
 from cvo_edge.input.frame import Frame
@@ -34,16 +34,6 @@ class Listing(NamedTuple):
 
     images: list[Path]
     left_out: dict[str, int]
-
-
-def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key that compares digits as numbers: ``frame-2`` before ``frame-10``."""
-    parts = re.split("([0-9]+)", str(path))
-    return [
-        (1, 0, part) if index % 2 == 0 else (0, int(part), "")
-        for index, part in enumerate(parts)
-        if part
-    ]
 
 
 class ImageFiles:

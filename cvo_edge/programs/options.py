@@ -131,8 +131,8 @@ TimeoutOption = Annotated[
 GroundTruthOption = Annotated[
     Path | None,
     typer.Option(
-        help="True poses (7-Scenes, TUM, EuRoC, KITTI, COLMAP, transforms.json); adds coverage to "
-        "the summary.",
+        help="True poses in any format that training reads (7-Scenes, TUM, EuRoC, KITTI, COLMAP, "
+        "...); adds coverage to the summary.",
         readable=False,
         rich_help_panel=REPORT,
     ),

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from cvo_edge.camera_check import LensEstimate
 from cvo_edge.estimate import Drift, PoseInterval, Status
-from cvo_edge.ground_truth import GroundTruth, Key
+from cvo_edge.ground_truth import GroundTruth
+from cvo_edge.ground_truth.found import Key
 from cvo_edge.input.frame import Source
 from cvo_edge.input.image_files import ImageFiles, left_out_text
 from cvo_edge.monitor.adaptation import Adapted

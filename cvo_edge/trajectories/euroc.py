@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.errors import SourceError
 from cvo_edge.trajectories.poses import (
     camera_pose,
-    matrix_to_pose,
     quaternion_fault,
     quaternion_pose,
+    rigid_transform,
 )
 from cvo_edge.trajectories.tables import read_rows, read_text
 from cvo_edge.trajectories.trajectory import Entry, Trajectory, trajectory_of
@@ -52,11 +51,4 @@ def read_body_camera(path: Path) -> NDArray[np.float64]:
     """Read ``T_body_camera`` (4, 4), metres, from a ``sensor.yaml``; raises SourceError."""
     text = read_text(path, "a camera's T_BS and intrinsics")
     match = _T_BS.search(re.sub("#.*", "", text))
-    try:
-        T = np.array(match[1].split(",") if match else [], dtype=np.float64)
-    except ValueError:
-        T = np.empty(0)
-    if T.size != 16 or matrix_to_pose(T.reshape(4, 4)) is None:
-        found = f"[{' '.join(match[1].split())}]"[:80] if match else "none"
-        raise SourceError(f"{path}: expected T_BS, 16 numbers of a rigid transform, found {found}")
-    return T.reshape(4, 4)
+    return rigid_transform(path, "T_BS", match and match[1])

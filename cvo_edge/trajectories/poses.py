@@ -85,6 +85,21 @@ def matrix_fault(T: Array) -> str | None:
     return None if np.abs(T[3] - [0, 0, 0, 1]).max() <= 1e-6 else "a last row other than 0 0 0 1"
 
 
+def rigid_transform(path: Path, key: str, text: str | None) -> Array:
+    """Return the transform (4, 4), metres, of 16 numbers with commas between them.
+
+    Raises SourceError for other text and for None, naming ``path`` and ``key``.
+    """
+    try:
+        T = np.array(text.split(",") if text else [], dtype=np.float64)
+    except ValueError:
+        T = np.empty(0)
+    if T.size != 16 or matrix_to_pose(T.reshape(4, 4)) is None:
+        found = "none" if text is None else f"[{' '.join(text.split())}]"[:80]
+        raise SourceError(f"{path}: expected {key}, 16 numbers of a rigid transform, found {found}")
+    return T.reshape(4, 4)
+
+
 def read_pose_matrix(path: Path) -> Array | None:
     """Read a 4x4 camera-to-world matrix in metres -> pose (7,), or None if it is invalid.
 
@@ -102,12 +117,15 @@ def pose_matrix_fault(path: Path) -> str | None:
 
 def read_pose_matrices(folder: Path, suffix: str) -> Trajectory[str]:
     """Read the matrices of a folder, by frame name; raises SourceError if none is valid."""
-    entries = []
-    for file in sorted(folder.glob("*" + suffix)):
-        pose = read_pose_matrix(file)
-        fault = pose_matrix_fault(file) if pose is None else None
-        entries.append(Entry(file.name.removesuffix(suffix), pose, file.name, fault))
+    files = sorted(folder.glob("*" + suffix))
+    entries = [matrix_entry(file.name.removesuffix(suffix), file) for file in files]
     return trajectory_of(folder, entries)
+
+
+def matrix_entry(name: str, path: Path) -> Entry[str]:
+    """Read the matrix of the frame with this name."""
+    pose = read_pose_matrix(path)
+    return Entry(name, pose, path.name, None if pose is not None else pose_matrix_fault(path))
 
 
 def _matrix(path: Path) -> Array:

@@ -10,18 +10,23 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 from cvo_edge.errors import SourceError
 from cvo_edge.estimate import PoseInterval, Status
 from cvo_edge.ground_truth import open_ground_truth
+from cvo_edge.input.image_files import frame_name
 from cvo_edge.input.sources import open_source
 from cvo_edge.pose import Chart, Pose
 from cvo_edge.sets import unbounded_set
 from cvo_edge.trajectories.euroc import read_euroc
 from cvo_edge.trajectories.kitti import read_kitti
 from cvo_edge.trajectories.tum import read_tum
+from cvo_edge.trajectories.tum_vi import read_imu_camera
 from cvo_export.datasets import open_dataset
+
+from .test_layouts import START_NS, T_CAMERA_IMU, ace, imu, tum_vi
 
 COUNT = 4
 STAMPS_NS = [1_403_636_579_763_555_584 + 50_000_000 * i for i in range(COUNT)]
@@ -180,6 +185,89 @@ def test_frames_get_the_poses_that_training_gives_them(tmp_path, write):
     np.testing.assert_allclose(matrices, poses(), atol=1e-9)
 
 
+def same_as_training(dataset, frames, path):
+    """The frames of folders that have a true pose, and the poses, are those of training."""
+    found = {}
+    for folder in frames:
+        truth = open_ground_truth(path, folder)
+        for estimate in estimates(folder):
+            if (pose := truth.pose_of(estimate)) is not None:
+                found[frame_name(estimate.source)] = pose
+    expected = open_dataset(dataset)
+    names = [name.rpartition("/")[2] for name in expected.frame_names]
+    assert sorted(found) == sorted(names)
+    np.testing.assert_array_equal([found[name] for name in names], expected.poses)
+    return truth
+
+
+@pytest.mark.parametrize("place", [".", "mav0/mocap0", "mav0/mocap0/data.csv", "dso/gt_imu.csv"])
+def test_tum_vi_is_interpolated_as_in_training(tmp_path, place, monkeypatch):
+    root = tum_vi(tmp_path / "room1", visits=((0.0, 0.5), (0.8, 1.1)), end=1.0)
+    poses = root / "mav0" / "mocap0" / "data.csv"
+    lines = poses.read_text().splitlines()
+    lines[20] = lines[20].rpartition(",")[0] + ",7"  # no quaternion
+    poses.write_text("\n".join(lines))
+    if place == "dso/gt_imu.csv":
+        poses.rename(root / place)
+    images = root / "mav0" / "cam0" / "data"
+    truth = same_as_training(f"tum-vi:{root}", [images], root / place)
+    assert truth.found.note == "moved from the IMU to cam0"
+    assert str(truth.skipped).startswith("skipped 1: invalid pose 1 (first in ")
+    assert truth.spans(START_NS, START_NS).endswith("at 1520530308.199 .. 1520530309.299 s")
+    # Another camera of the recording has its own way from the IMU.
+    chain = root / "dso" / "camchain.yaml"
+    cameras = yaml.safe_load(chain.read_text())
+    T_other_imu = T_CAMERA_IMU @ T_CAMERA_IMU
+    cameras["cam1"]["T_cam_imu"] = T_other_imu.tolist()
+    chain.write_text(yaml.safe_dump(cameras))
+    (root / "mav0" / "cam0").rename(root / "mav0" / "cam1")
+    monkeypatch.chdir(root / "mav0" / "cam1" / "data")
+    first, *_ = estimates(".")
+    T = Pose.from_array(open_ground_truth(root / place, ".").pose_of(first)).to_matrix()
+    expected = imu((first.stamp_ns - START_NS) / 1e9) @ np.linalg.inv(T_other_imu)
+    np.testing.assert_allclose(T, expected, atol=1e-6)
+
+
+def test_ace_poses_belong_to_the_images_at_their_place(tmp_path):
+    parts = [tmp_path / "train", tmp_path / "test"]
+    for part, count in zip(parts, (3, 2), strict=True):
+        names = [f"{part.name}-frame-{number:06d}" for number in range(count)]
+        ace(part, names, lambda number: "52.5")
+        for number, pose in enumerate(sorted((part / "poses").iterdir())):
+            pose.rename(pose.with_name(f"{number:04d}.txt"))
+    (parts[0] / "poses" / "0001.txt").write_text("nan " * 16)
+    same_as_training(f"ace:{tmp_path}", [part / "rgb" for part in parts], tmp_path)
+    for place in (parts[1], parts[1] / "poses"):
+        same_as_training(f"ace:{parts[1]}", [parts[1] / "rgb"], place)
+    with pytest.raises(SourceError, match=rf"found those of {tmp_path}; name one .* {parts[1]}$"):
+        open_ground_truth(tmp_path, tmp_path)
+    (parts[1] / "poses" / "0001.txt").unlink()
+    with pytest.raises(SourceError, match="expected as many files in poses as in rgb, found 1 and"):
+        open_ground_truth(parts[1], tmp_path)
+
+
+def test_kalibr_s_file_is_read_as_by_yaml(tmp_path):
+    """In every layout that YAML's writers give it."""
+    path = tmp_path / "camchain.yaml"
+    T = T_CAMERA_IMU.copy()
+    T[0, 3] = -1e-7
+    camera = {"T_cam_imu": T.tolist(), "camera_model": "pinhole", "rostopic": "/cam1/image"}
+    second = {"cam_overlaps": [0], "T_cn_cnm1": np.eye(4).tolist(), "T_cam_imu": [*range(3)]}
+    for flow in (None, False, True):
+        for width, order in ((80, True), (20, False), (1000, False)):
+            text = yaml.safe_dump(
+                {"cam0": camera, "cam1": second},
+                default_flow_style=flow,
+                width=width,
+                sort_keys=order,
+            )
+            path.write_text(f"%YAML:1.0\n# cam0: T_cam_imu\n{text}")
+            written = np.array(yaml.safe_load(text)["cam0"]["T_cam_imu"], float)
+            np.testing.assert_array_equal(read_imu_camera(path), np.linalg.inv(written))
+            with pytest.raises(SourceError, match=r"T_cam_imu of cam1, 16 numbers .* found \["):
+                read_imu_camera(path, "cam1")
+
+
 EVO = shutil.which("evo_traj")
 
 
@@ -212,6 +300,10 @@ def test_what_leads_to_the_camera_is_needed(tmp_path):
         open_ground_truth(path, frames)
     # Frames that nothing tells about are those of camera 0.
     assert open_ground_truth(path, tmp_path).found.note == ""
+    folder = tum_vi(tmp_path / "c", [(0.0, 0.1)], 0.05)
+    (folder / "dso" / "camchain.yaml").unlink()
+    with pytest.raises(SourceError, match=r"expected .*/dso/camchain.yaml with T_cam_imu"):
+        open_ground_truth(folder, tmp_path)
 
 
 def test_other_files_are_refused_with_the_formats(tmp_path):

@@ -131,8 +131,12 @@ def test_tum_vi_rooms_share_a_world_and_the_poses_of_dso_serve_as_well(tmp_path)
 @pytest.mark.parametrize(
     ("file", "text", "expected"),
     [
-        ("dso/camchain.yaml", "cam1: {}", "cam0 with T_cam_imu and intrinsics, found no cam0"),
-        ("dso/camchain.yaml", "cam0: {}", "T_cam_imu, 16 numbers of a rigid transform, found None"),
+        ("dso/camchain.yaml", "cam1: {}", "cam0 with T_cam_imu, found cam1"),
+        (
+            "dso/camchain.yaml",
+            "cam0: {}",
+            "T_cam_imu of cam0, 16 numbers of a rigid transform, found none",
+        ),
         ("mav0/mocap0/data.csv", "# none", "poses, found none"),
         (
             "mav0/mocap0/data.csv",

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cvo_edge.errors import CvoError, SourceError, UsageError
-from cvo_edge.input.image_files import natural_key
+from cvo_edge.files import natural_key
 
 _SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
+from cvo_edge.trajectories.interpolation import Mask, Stamps, Track
 from cvo_edge.trajectories.poses import quaternion_pose
 from cvo_export.datasets.bag import Bag, stamp_ns
-from cvo_export.datasets.interpolation import Mask, Stamps, Track
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
-from cvo_edge.input.image_files import natural_key
+from cvo_edge.files import natural_key
 from cvo_edge.trajectories.colmap import Image, model_folder, read_images
 from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.camera_groups import MOST_SPREAD, alike

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.input.image_files import natural_key
+from cvo_edge.files import natural_key
 
 Camera = TypeVar("Camera")
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cvo_edge.errors import SourceError
-from cvo_edge.input.image_files import natural_key
+from cvo_edge.files import natural_key
 from cvo_edge.trajectories.kitti import CALIBRATION, pose_file, read_calibration, read_kitti
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.folders import only_world

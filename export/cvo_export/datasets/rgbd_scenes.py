@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from cvo_edge.input.image_files import natural_key
+from cvo_edge.files import natural_key
 from cvo_edge.trajectories.rgbd_scenes import read_rgbd_scenes
 from cvo_export.datasets.base import Intrinsics, PoseDataset
 from cvo_export.datasets.folders import only_world

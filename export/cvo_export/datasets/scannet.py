@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from cvo_edge.input.image_files import natural_key
+from cvo_edge.files import natural_key
 from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.camera_matrices import centred, matrix_intrinsics, read_numbers
 from cvo_export.datasets.folders import only_world

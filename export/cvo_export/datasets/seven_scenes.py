@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from cvo_edge.errors import SinkError, SourceError
-from cvo_edge.input.image_files import frame_name, natural_key
+from cvo_edge.files import natural_key
+from cvo_edge.input.image_files import frame_name
 from cvo_edge.pose import Pose
 from cvo_edge.trajectories.poses import MATRIX_SUFFIX
 from cvo_export.datasets.base import Intrinsics, PoseDataset

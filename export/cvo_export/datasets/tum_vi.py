@@ -1,15 +1,9 @@
 """TUM-VI (Schubert et al. 2018), its layout for EuRoC and DSO: ``mav0`` and ``dso``.
 
 ``mav0/cam0/data.csv`` lists ``timestamp,filename`` of the images in ``mav0/cam0/data``, grey, 16
-bits. ``mav0/mocap0/data.csv`` lists ``timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z``: integer nanoseconds,
-metres and a quaternion, scalar first. This is the pose of the IMU in the frame of the motion
-capture system, 120 a second; ``dso/gt_imu.csv`` has the same columns. ``T_cam_imu`` in
-``dso/camchain.yaml`` (Kalibr) maps points from the IMU's frame to the camera's, so
-
-    T_world_camera = T_world_imu @ inverse(T_cam_imu)
-
-The motion capture system hangs in one room: of recordings that leave it, only the start and the end
-have poses. The lens is a fisheye (equidistant); its distortion is read, not corrected.
+bits; ``cvo_edge.trajectories.tum_vi`` describes the poses. The motion capture system hangs in one
+room: of recordings that leave it, only the start and the end have poses. The lens is a fisheye
+(equidistant); its distortion is read, not corrected.
 """
 
 from __future__ import annotations
@@ -20,26 +14,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.errors import SourceError
-from cvo_edge.trajectories.euroc import read_euroc
 from cvo_edge.trajectories.poses import matrix_to_pose
 from cvo_edge.trajectories.tables import read_rows
+from cvo_edge.trajectories.tum_vi import (
+    CAMERA,
+    MAX_STAMP_DIFFERENCE_NS,
+    POSES,
+    read_imu_camera,
+    read_imu_track,
+)
 from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.folders import only_camera, recordings
 from cvo_export.datasets.frames import FrameList
-from cvo_export.datasets.interpolation import Track
-from cvo_export.datasets.yaml_cameras import Pinhole, pinhole, read_document, rigid_transform
+from cvo_export.datasets.yaml_cameras import Pinhole, pinhole, read_document
 
 _IMAGES = "mav0/cam0/data.csv"
-_POSES = ("mav0/mocap0/data.csv", "dso/gt_imu.csv")
-_CAMERA = "dso/camchain.yaml"
-
-# More than half a period of the motion capture system (120 Hz).
-_MAX_STAMP_DIFFERENCE_NS = 5_000_000
 # Poses further apart belong to different visits of the room.
 _GAP_NS = 1_000_000_000
-
-_INVALID = np.full(7, np.nan)
 
 
 def open_tum_vi(path: str) -> PoseDataset:
@@ -58,13 +49,13 @@ def open_tum_vi(path: str) -> PoseDataset:
     cameras: dict[str, Pinhole | None] = {}
     partial: list[str] = []
     for name, folder in recordings(root, _IMAGES).items():
-        cameras[name], T_imu_camera = _read_camera(folder / _CAMERA)
+        cameras[name], T_imu_camera = _read_camera(folder / CAMERA)
         partial += _add_recording(frames, name, folder, T_imu_camera)
     dataset = replace(frames.dataset(root.resolve().name), chosen="; ".join(partial))
     camera = only_camera(root, cameras)
     if camera is None:
         return dataset
-    return camera.of(dataset, f"{root}: {_CAMERA}")
+    return camera.of(dataset, f"{root}: {CAMERA}")
 
 
 def _add_recording(
@@ -75,16 +66,17 @@ def _add_recording(
         (row.nanoseconds(), row.fields[1])
         for row in read_rows(folder / _IMAGES, "timestamp,filename", separator=",")
     )
-    track = _read_track(folder)
+    places = [folder / each for each in POSES]
+    track, _ = read_imu_track(next(filter(Path.is_file, places), places[0]))
     stamps_ns = np.array([stamp_ns for stamp_ns, _ in rows], np.int64)
-    T_world_imu, near = track.at(stamps_ns, _MAX_STAMP_DIFFERENCE_NS)
+    T_world_imu, near = track.at(stamps_ns, MAX_STAMP_DIFFERENCE_NS)
     images = (folder / _IMAGES).with_name("data")
     for (stamp_ns, file), T, found in zip(rows, T_world_imu @ T_imu_camera, near, strict=True):
         if found:
             image = images / file
             frames.add(name, image.stem, image, matrix_to_pose(T), stamp_ns)
         else:
-            frames.skip(f"no pose within {_MAX_STAMP_DIFFERENCE_NS / 1e9:g} s")
+            frames.skip(f"no pose within {MAX_STAMP_DIFFERENCE_NS / 1e9:g} s")
     if near.all():
         return []
     steps_ns = np.diff(track.stamps_ns)
@@ -97,19 +89,9 @@ def _add_recording(
     ]
 
 
-def _read_track(folder: Path) -> Track:
-    path = next((folder / each for each in _POSES if (folder / each).is_file()), folder / _POSES[0])
-    # The columns are EuRoC's, and here the body is the IMU.
-    trajectory = read_euroc(path, np.eye(4))
-    poses = [_INVALID if pose is None else pose for pose in trajectory.poses]
-    return Track.of(trajectory.keys, poses)
-
-
 def _read_camera(path: Path) -> tuple[Pinhole | None, NDArray[np.float64]]:
     """Return the intrinsics with the lens of ``cam0``, and ``T_imu_camera``, (4, 4), metres."""
+    T_imu_camera = read_imu_camera(path)
     camera = read_document(path, "cam0 with T_cam_imu").get("cam0")
-    if not isinstance(camera, dict):
-        raise SourceError(f"{path}: expected cam0 with T_cam_imu and intrinsics, found no cam0")
-    T_camera_imu = rigid_transform(path, "T_cam_imu", camera.get("T_cam_imu"))
-    T_imu_camera = np.asarray(np.linalg.inv(T_camera_imu), np.float64)
-    return pinhole(path, camera, "distortion_coeffs"), T_imu_camera
+    found = pinhole(path, camera, "distortion_coeffs") if isinstance(camera, dict) else None
+    return found, T_imu_camera

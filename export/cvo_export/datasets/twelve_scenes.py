@@ -14,7 +14,8 @@ from pathlib import Path
 
 from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
-from cvo_edge.input.image_files import frame_name, natural_key
+from cvo_edge.files import natural_key
+from cvo_edge.input.image_files import frame_name
 from cvo_edge.trajectories.poses import MATRIX_SUFFIX
 from cvo_edge.trajectories.tables import read_text
 from cvo_export.datasets.base import PoseDataset

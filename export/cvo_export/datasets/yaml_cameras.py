@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from cvo_edge.camera import Camera, Distortion
 from cvo_edge.errors import SourceError
-from cvo_edge.trajectories.poses import matrix_to_pose
 from cvo_edge.trajectories.tables import read_text
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.sizes import with_camera
@@ -42,15 +41,6 @@ def read_document(path: Path, key: str) -> dict[Any, Any]:
     if not isinstance(document, dict):
         raise SourceError(f"{path}: expected YAML with {key} and intrinsics, found other text")
     return document
-
-
-def rigid_transform(path: Path, key: str, values: object) -> Array:
-    """Return the transform (4, 4) of 16 numbers or four rows; raises SourceError for others."""
-    matrix = _numbers(values, 16)
-    if matrix is None or matrix_to_pose(matrix.reshape(4, 4)) is None:
-        found = " ".join(str(values).split())[:80]
-        raise SourceError(f"{path}: expected {key}, 16 numbers of a rigid transform, found {found}")
-    return matrix.reshape(4, 4)
 
 
 class Pinhole(NamedTuple):
