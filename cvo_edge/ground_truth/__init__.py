@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.estimate import PoseInterval
+from cvo_edge.ground_truth.bags import bag_options
 from cvo_edge.ground_truth.detect import find_poses
 from cvo_edge.ground_truth.found import Found, Key
 from cvo_edge.input.image_files import frame_name
@@ -66,21 +67,32 @@ class GroundTruth:
         return f"{first} .. {last}"
 
 
-def open_ground_truth(path: Path, source: str | os.PathLike[str] = "") -> GroundTruth:
+def named_files(path: str | None) -> list[Path]:
+    """Return the files and folders that a value of ``open_ground_truth`` names."""
+    if path is None:
+        return []
+    place, options = bag_options(path) or (Path(path), {})
+    return [place, *(Path(options[name]) for name in options.keys() & {"extrinsics"})]
+
+
+def open_ground_truth(
+    path: str | os.PathLike[str], source: str | os.PathLike[str] = ""
+) -> GroundTruth:
     """Read true poses in any format of ``cvo_edge.ground_truth.detect``.
 
     Parameters
     ----------
     path
-        File or folder.
+        File or folder; for a ROS bag also ``rosbag:PATH,option=value...``, as in training.
     source
         Folder, glob or file of the frames, whose place in a recording says which camera's or which
         part's poses are wanted.
 
     Raises SourceError if the format is unknown, a file is malformed, what leads to the camera is
-    missing, or no pose is valid.
+    missing, or no pose is valid; UsageError for unknown options, and for a bag if the library
+    ``rosbags`` is not installed.
     """
     # The names of the folders above count, also of `.`.
     given = Path(source).absolute()
     folder = os.path.isdir(source)  # noqa: PTH112 - also of a name too long
-    return GroundTruth(find_poses(path, given if folder else given.parent))
+    return GroundTruth(find_poses(os.fspath(path), given if folder else given.parent))

@@ -13,10 +13,11 @@ twelve columns               KITTI, moved from camera 0 to the camera        by 
 seven columns                RGB-D Scenes v2                                 by number
 ``images.bin``, image lines  COLMAP                                          by name
 JSON with ``frames``         nerfstudio, instant-ngp (``transforms.json``)   by name
+``.bag``, ``.mcap``...       ROS bags, with the options of training          by stamp, interpolated
 ===========================  ==============================================  =======================
 
-TUM-VI needs a pose within 5 ms, too. A folder may also be a recording of these data sets, in which
-the file has its usual name.
+Of interpolated poses, the nearest is within 5 ms (TUM-VI) or 0.02 s (bags). A folder may also be a
+recording of these data sets, in which the file has its usual name.
 """
 
 from __future__ import annotations
@@ -29,9 +30,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
+from cvo_edge.ground_truth.bags import bag_options, find_bag_poses
 from cvo_edge.ground_truth.found import Found, by_key, by_nearest_stamp, interpolated
 from cvo_edge.input.image_files import frame_name
 from cvo_edge.trajectories import ace, colmap, euroc, kitti, transforms, tum, tum_vi
+from cvo_edge.trajectories.bag import is_bag
 from cvo_edge.trajectories.interpolation import Mask, Stamps
 from cvo_edge.trajectories.poses import (
     MATRIX_SUFFIX,
@@ -48,17 +51,19 @@ Array = NDArray[np.float64]
 FORMATS = (
     f"a folder of *{MATRIX_SUFFIX}, or poses of TUM (8 columns), KITTI (12 columns), EuRoC "
     "(data.csv), TUM-VI (mocap0, gt_imu.csv), ACE (rgb, poses, calibration), RGB-D Scenes (7 "
-    "columns), COLMAP (images.txt, images.bin) or transforms.json"
+    "columns), COLMAP (images.txt, images.bin), transforms.json or a ROS bag (.bag, .mcap, .db3)"
 )
-_BAGS = (".bag", ".mcap", ".db3")
 
 
-def find_poses(path: Path, frames: Path) -> Found:
-    """Read the poses at ``path``, of the camera whose frames are in the folder ``frames``.
+def find_poses(given: str, frames: Path) -> Found:
+    """Read the poses that ``given`` names, of the camera whose frames are in the folder ``frames``.
 
     Raises SourceError if the format is not one of those above, a file is malformed, what leads to
-    the camera is missing, or no pose is valid.
+    the camera is missing, or no pose is valid; UsageError as ``find_bag_poses`` does.
     """
+    if (bag := bag_options(given)) is not None:
+        return find_bag_poses(*bag)
+    path = Path(given)
     if path.is_dir():
         if (part := ace.part_of(path, frames)) is not None:
             return by_key("name", _ace(part))
@@ -67,6 +72,8 @@ def find_poses(path: Path, frames: Path) -> Found:
             if first and (suffix == MATRIX_SUFFIX or read_pose_matrix(first) is not None):
                 return by_key("name", read_pose_matrices(path, suffix))
         file = _file_in(path)
+        if file is None and any(is_bag(each) for each in path.iterdir()):
+            return find_bag_poses(path, {})
         if file is None:
             raise SourceError(f"{path}: expected {FORMATS}, found none of them")
         path = file
@@ -77,8 +84,6 @@ def find_poses(path: Path, frames: Path) -> Found:
 
 def _file_in(folder: Path) -> Path | None:
     """Return the file of poses in a recording's folder, or None."""
-    if (folder / "metadata.yaml").is_file():
-        raise _bag(folder)
     model = colmap.model_folder(folder)
     places = [
         folder / "groundtruth.txt",
@@ -97,8 +102,6 @@ def _file_in(folder: Path) -> Path | None:
 
 
 def _read_file(path: Path, frames: Path) -> Found:
-    if path.suffix in _BAGS:
-        raise _bag(path)
     # The lines of keypoints make this file longer than those of other formats may be.
     if path.suffix == ".bin" or path.name == "images.txt":
         return by_key("name", _colmap(path, frames))
@@ -204,10 +207,3 @@ def _camera0_camera(path: Path, frames: Path) -> tuple[Array, str]:
             f"{frames.name}, found none"
         )
     return kitti.read_calibration(calibration, int(found[1]))[1], f"moved to camera {found[1]}"
-
-
-def _bag(path: Path) -> SourceError:
-    return SourceError(
-        f"{path}: expected {FORMATS}, found a ROS bag, which the runtime does not read; write its "
-        f"frames and poses with `cvo-export render rosbag:{path} FOLDER`"
-    )

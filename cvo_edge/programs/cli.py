@@ -126,7 +126,7 @@ def run(
 ) -> None:
     """Estimate a pose interval for every frame of a source."""
     from cvo_edge.camera import read_camera
-    from cvo_edge.ground_truth import open_ground_truth
+    from cvo_edge.ground_truth import named_files, open_ground_truth
     from cvo_edge.input.capture import shown
     from cvo_edge.input.sources import open_source
     from cvo_edge.odometer import Odometer
@@ -140,10 +140,10 @@ def run(
     if label_delay and labels is None:
         raise UsageError("--label-delay: expected --labels FILE with it, found no labels")
     written_as = format_of(output, format)
-    read = (source, ground_truth, bundle, public_key, camera, labels, state, stamps)
-    refuse_overwriting(output, *read)
-    truth = open_ground_truth(ground_truth, source) if ground_truth else None
-    labelled = open_ground_truth(labels, source) if labels else None
+    read = (source, bundle, public_key, camera, state, stamps)
+    refuse_overwriting(output, *read, *named_files(ground_truth), *named_files(labels))
+    truth = None if ground_truth is None else open_ground_truth(ground_truth, source)
+    labelled = None if labels is None else open_ground_truth(labels, source)
     frames = open_source(source, fps, timeout, stamps)
     with Odometer.load(
         bundle,

@@ -129,20 +129,21 @@ TimeoutOption = Annotated[
     ),
 ]
 GroundTruthOption = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
+        metavar="<PATH>",
         help="True poses in any format that training reads (7-Scenes, TUM, EuRoC, KITTI, COLMAP, "
-        "...); adds coverage to the summary.",
-        readable=False,
+        "ROS bags...); adds coverage to the summary. A bag may have options: "
+        "rosbag:PATH,pose=TOPIC.",
         rich_help_panel=REPORT,
     ),
 ]
 LabelsOption = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
         "--labels",
+        metavar="<PATH>",
         help="True poses of some frames, as for --ground-truth; the intervals adapt to them.",
-        readable=False,
         show_default=False,
         rich_help_panel=ADAPTATION,
     ),

@@ -27,6 +27,11 @@ class Track(NamedTuple):
         stamps, kept = np.unique(np.array(stamps_ns, np.int64), return_index=True)
         return cls(stamps, np.array(poses, np.float64).reshape(-1, 7)[kept])
 
+    @property
+    def valid(self) -> Mask:
+        """Which poses are valid (n,)."""
+        return np.asarray(np.isfinite(self.poses).all(axis=1))
+
     def at(self, stamps_ns: Stamps, bound_ns: int) -> tuple[Array, Mask]:
         """Return transforms (m, 4, 4) at stamps (m,), and whether the nearest is within a bound.
 
@@ -39,7 +44,7 @@ class Track(NamedTuple):
         near = np.minimum(np.abs(past), np.abs(left)) <= bound_ns
         span = (self.stamps_ns[after] - self.stamps_ns[before]).astype(np.float64)
         share = np.clip(past / np.where(span > 0, span, 1.0), 0.0, 1.0)[:, np.newaxis]
-        valid = np.asarray(np.isfinite(self.poses).all(axis=1))
+        valid = self.valid
         alone = np.where(np.abs(past) <= np.abs(left), before, after)
         both = valid[before] & valid[after]
         before, after = np.where(both, before, alone), np.where(both, after, alone)

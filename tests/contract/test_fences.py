@@ -15,6 +15,7 @@ MODULES = sorted(
     for path in PACKAGE.rglob("*.py")
 )
 FORBIDDEN = {"torch", "torchvision", "timm", "onnx", "sklearn", "scipy", "cvo_export", "pydantic"}
+FORBIDDEN |= {"rosbags", "ruamel", "yaml"}
 
 
 def fresh_process(code):

@@ -126,7 +126,7 @@ def test_the_lowest_constraints_are_the_declared_lower_bounds():
 @pytest.mark.parametrize(
     ("file", "name", "extras"),
     [
-        ("runtime.txt", "cvo-edge", ("openvino", "sign")),
+        ("runtime.txt", "cvo-edge", ("openvino", "rosbag", "sign")),
         ("export.txt", "cvo-export", ("plot", "ray", "rosbag")),
     ],
 )

@@ -3,6 +3,7 @@
 import re
 import shutil
 import sqlite3
+import sys
 
 import cv2
 import numpy as np
@@ -10,8 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.ground_truth import named_files, open_ground_truth
 from cvo_edge.pose import Pose
 from cvo_export.datasets import Intrinsics, Lens, open_dataset
+
+from .true_poses import same_as_training
 
 rosbags = pytest.importorskip("rosbags.highlevel")
 from rosbags import rosbag1, rosbag2  # noqa: E402
@@ -463,3 +467,74 @@ def test_a_damaged_bag_is_one_line(tmp_path, kind):
     refused(tmp_path / "none", "or a folder of bags, found none")
     (tmp_path / "text.txt").write_text("no bag")
     refused(tmp_path / "text.txt", "or a folder of bags, found another file")
+
+
+def frames_of(folder, path, topic):
+    """A file for each image of a bag, with the name of its stamp."""
+    folder.mkdir()
+    for stamp, _ in read_independently(path, topic):
+        name = f"{stamp // 10**9}.{stamp % 10**9:09d}.png"
+        cv2.imwrite(str(folder / name), GREY)
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_ground_truth_is_the_poses_of_training(tmp_path, kind):
+    path = write(tmp_path / "robot", kind, robot(maker(kind)))
+    matrix = tmp_path / "T_body_camera.txt"
+    np.savetxt(matrix, MOUNT)
+    frames = [frames_of(tmp_path / "frames", path, "/image")]
+    for options, said in (
+        ("pose=/tf", "/tf, map to cam"),
+        ("world=odom,frame=base", "/tf, odom to base"),
+        ("pose=/odom,image=/image,camera=none", "/odom of base, transformed to cam"),
+        ("pose=/odom,extrinsics=none", "/odom of base, taken as the camera's"),
+        ("pose=/mocap,body=base", "/mocap of base, transformed to cam"),
+        (f"pose=/mocap,extrinsics={matrix}", "/mocap, extrinsics T_body_camera.txt"),
+    ):
+        dataset = f"rosbag:{path},{options}"
+        truth = same_as_training(dataset, frames, dataset)
+        assert (truth.found.note, truth.found.by) == (said, "stamp")
+    assert named_files(f"rosbag:{path},extrinsics={matrix}") == [path, matrix]
+    assert named_files(f"{path},pose=/tf") == [path]
+    with pytest.raises(SourceError, match=r"found /mocap, /odom, /tf; choose one, e.g. pose="):
+        open_ground_truth(path, frames[0])
+    with pytest.raises(UsageError, match=r"rosbag: expected PATH and any of image=.*found 'poze"):
+        open_ground_truth(f"{path},poze=/tf", frames[0])
+
+
+def test_a_bag_alone_or_in_its_folder_is_ground_truth(tmp_path):
+    make = maker("sqlite3")
+    rows = list(recording(make, 6))
+    rows[5][2].pose.orientation.w = float("nan")
+    (tmp_path / "bags").mkdir()
+    path = write(tmp_path / "bags" / "walk", "sqlite3", rows)
+    frames = [frames_of(tmp_path / "frames", path, "/cam/image_raw")]
+    for place in (path, tmp_path / "bags", f"rosbag:{tmp_path / 'bags'}"):
+        truth = same_as_training(f"rosbag:{path}", frames, place)
+        assert str(truth.skipped) == "skipped 1: invalid pose 1"
+        assert truth.spans(None, None).startswith("frames without a stamp, poses at 1700000000.005")
+    write(tmp_path / "bags" / "other", "mcap", rows)
+    with pytest.raises(SourceError, match=r"expected the bag .*, found other.mcap, walk; name one"):
+        open_ground_truth(tmp_path / "bags", frames[0])
+    # A bag of poses alone says nothing of the camera, unless it needs not.
+    path = write(tmp_path / "alone", "mcap", rows[1::2])
+    assert open_ground_truth(path).found.note == "/pose"
+    odometry = make.posed("Odometry", START_NS, MOUNT)
+    path = write(tmp_path / "odom", "mcap", [("/odom", START_NS, odometry)])
+    with pytest.raises(SourceError, match=r"images: none; or name the camera's frame, e.g. f"):
+        open_ground_truth(path)
+    assert open_ground_truth(f"{path},frame=base").found.note == "/odom of base"
+
+
+def test_without_rosbags_one_line_says_what_to_install(tmp_path, monkeypatch):
+    path = write(tmp_path / "a", "mcap", recording(maker("mcap"), 1))
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    for read in (open_ground_truth, lambda path: open_dataset(f"rosbag:{path}")):
+        with pytest.raises(UsageError) as refusal:
+            read(path)
+        assert str(refusal.value) == (
+            f"{path}: expected the library rosbags to read a bag, found it not installed; pip "
+            'install "cvo-edge[rosbag]", or write frames and poses where it is: cvo-export render '
+            f"rosbag:{path} FOLDER"
+        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,48 +10,15 @@ from numpy.typing import NDArray
 
 from cvo_edge.camera import Distortion
 from cvo_edge.errors import SourceError
-from cvo_edge.input.decoding import MAX_PIXELS, decode_image, image_size
-from cvo_export.datasets.bag import Bag
+from cvo_edge.input.bag_images import FORMS, message_size
+from cvo_edge.input.decoding import decode_image
+from cvo_edge.trajectories.bag import Bag
 from cvo_export.datasets.base import NO_DISTORTION, Intrinsics, Lens
 
 Image = NDArray[np.uint8]
 
-_RAW, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
-
-class _Form(NamedTuple):
-    """Bytes of a number, numbers of a pixel, and OpenCV's conversion to BGR."""
-
-    depth: int
-    channels: int
-    conversion: int | None
-
-
-# Names of sensor_msgs/image_encodings.h. OpenCV names a Bayer pattern by its first two pixels.
-_FORMS: dict[str, _Form] = {
-    "bgr8": _Form(1, 3, None),
-    "8UC3": _Form(1, 3, None),
-    "rgb8": _Form(1, 3, cv2.COLOR_RGB2BGR),
-    "bgra8": _Form(1, 4, cv2.COLOR_BGRA2BGR),
-    "rgba8": _Form(1, 4, cv2.COLOR_RGBA2BGR),
-    "bgr16": _Form(2, 3, None),
-    "rgb16": _Form(2, 3, cv2.COLOR_RGB2BGR),
-    "mono8": _Form(1, 1, cv2.COLOR_GRAY2BGR),
-    "8UC1": _Form(1, 1, cv2.COLOR_GRAY2BGR),
-    "mono16": _Form(2, 1, cv2.COLOR_GRAY2BGR),
-    "yuv422": _Form(1, 2, cv2.COLOR_YUV2BGR_UYVY),
-    "yuv422_yuy2": _Form(1, 2, cv2.COLOR_YUV2BGR_YUY2),
-} | {
-    f"bayer_{pattern}{8 * depth}": _Form(depth, 1, conversion)
-    for pattern, conversion in (
-        ("rggb", cv2.COLOR_BayerRGGB2BGR),
-        ("bggr", cv2.COLOR_BayerBGGR2BGR),
-        ("gbrg", cv2.COLOR_BayerGBRG2BGR),
-        ("grbg", cv2.COLOR_BayerGRBG2BGR),
-    )
-    for depth in (1, 2)
-}
 
 _MODELS: dict[str, Distortion] = {
     "plumb_bob": "radial_tangential",
@@ -59,18 +26,6 @@ _MODELS: dict[str, Distortion] = {
     "equidistant": "equidistant",
     "fisheye": "equidistant",
 }
-
-
-def message_size(message: Any) -> tuple[int, int] | None:
-    """Return height and width of the image in a message, or None if it cannot be decoded."""
-    if not hasattr(message, "encoding"):
-        return image_size(message.data.tobytes())
-    form = _FORMS.get(message.encoding)
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    if form is None or not 0 < height * width <= MAX_PIXELS:
-        return None
-    whole = step >= width * form.channels * form.depth and message.data.size >= step * height
-    return (height, width) if whole else None
 
 
 def message_image(message: Any) -> Image | None:
@@ -83,7 +38,7 @@ def message_image(message: Any) -> Image | None:
     size = message_size(message)
     if size is None:
         return None
-    form, (height, width) = _FORMS[message.encoding], size
+    form, (height, width) = FORMS[message.encoding], size
     rows = message.data[: message.step * height].reshape(height, message.step)
     pixels = np.ascontiguousarray(rows[:, : width * form.channels * form.depth])
     if form.depth == 2:
@@ -97,50 +52,6 @@ def message_image(message: Any) -> Image | None:
         return np.asarray(cv2.cvtColor(pixels, form.conversion), np.uint8)
     except cv2.error:
         return None
-
-
-def image_topic(bag: Bag, wanted: str | None) -> str:
-    """Return the wanted topic, or the only one with colour or grey images.
-
-    Of an image and its compressed copy, ``TOPIC/compressed``, the former is used.
-
-    Raises SourceError if there is none or more than one, naming the candidates.
-    """
-    topics = bag.of_types((_RAW, _COMPRESSED))
-    usable = [topic for topic in topics if message_size(bag.first(topic)) is not None]
-    candidates = [each for each in usable if each.removesuffix("/compressed") == each]
-    candidates += [
-        each for each in usable if each not in candidates and _parent(each) not in candidates
-    ]
-    if wanted is not None:
-        if wanted in usable:
-            return wanted
-        if wanted in topics:
-            kind = _kind(bag, wanted)
-            raise SourceError(
-                f"{bag.path}: expected images of 8 or 16 bits in {wanted}, found {kind}"
-            )
-    elif len(candidates) == 1:
-        return candidates[0]
-    elif candidates:
-        raise SourceError(
-            f"{bag.path}: expected one topic of images, found {', '.join(candidates)}; choose one, "
-            f"e.g. image={candidates[0]}"
-        )
-    described = ", ".join(f"{each} ({_kind(bag, each)})" for each in topics)
-    raise SourceError(
-        f"{bag.path}: expected a topic {wanted or 'of colour or grey images'}, found none; topics "
-        f"of images: {described or 'none'}"
-    )
-
-
-def _parent(topic: str) -> str:
-    return topic.rpartition("/")[0]
-
-
-def _kind(bag: Bag, topic: str) -> str:
-    first = bag.first(topic)
-    return str(getattr(first, "encoding", getattr(first, "format", "")))
 
 
 def bag_camera(
@@ -172,7 +83,7 @@ def bag_camera(
             )
         return _camera(bag, wanted, images)
     fitting = [topic for topic in topics if _fits(bag.first(topic), frame, size)]
-    base = _parent(images.removesuffix("/compressed"))
+    base = images.removesuffix("/compressed").rpartition("/")[0]
     beside = f"{base}/camera_info"
     if beside in fitting:
         return _camera(bag, beside, images)

@@ -17,10 +17,10 @@ from cvo_edge.camera import Camera
 from cvo_edge.errors import SourceError
 from cvo_edge.files import natural_key
 from cvo_edge.trajectories.colmap import Image, model_folder, read_images
+from cvo_edge.trajectories.path_options import path_options
 from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.camera_groups import MOST_SPREAD, alike
 from cvo_export.datasets.colmap_cameras import Stated, read_cameras
-from cvo_export.datasets.folders import path_options
 from cvo_export.datasets.frames import FrameList
 from cvo_export.datasets.sizes import with_camera
 

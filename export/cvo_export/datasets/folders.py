@@ -1,12 +1,12 @@
-"""Find the recordings under a path, and divide it from its options."""
+"""Find the recordings under a path, and the camera that they share."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeVar
 
-from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.errors import SourceError
 from cvo_edge.files import natural_key
 
 Camera = TypeVar("Camera")
@@ -25,33 +25,6 @@ def recordings(root: Path, marker: str) -> dict[str, Path]:
     if not found:
         raise SourceError(f"{root}: expected {marker}, or folders that contain it, found neither")
     return found
-
-
-def path_options(kind: str, text: str, known: Sequence[str]) -> tuple[str, dict[str, str]]:
-    """Divide ``PATH,option=value...``; an existing path is one as a whole, with its commas.
-
-    Raises UsageError, which begins with ``kind``, for unknown and repeated options.
-    """
-    if Path(text).exists():
-        return text, {}
-    place, *items = text.split(",")
-    return place, read_options(f"{kind}: expected PATH and", items, known)
-
-
-def read_options(before: str, items: Sequence[str], known: Sequence[str]) -> dict[str, str]:
-    """Return the values of ``option=value`` items, by option.
-
-    Raises UsageError, which begins with ``before``, for unknown, empty and repeated options.
-    """
-    options: dict[str, str] = {}
-    for item in items:
-        name, _, value = item.partition("=")
-        if name not in known or not value or name in options:
-            raise UsageError(
-                f"{before} any of {', '.join(f'{each}=' for each in known)} once, found {item!r}"
-            )
-        options[name] = value
-    return options
 
 
 def only_world(root: Path, folders: list[Path], kind: str) -> Path:

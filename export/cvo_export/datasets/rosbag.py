@@ -2,16 +2,7 @@
 
 ``PATH[,image=TOPIC][,pose=TOPIC][,camera=TOPIC][,world=FRAME][,frame=FRAME][,body=FRAME]``
 ``[,extrinsics=FILE]``. Without an option, the bag must leave one choice; errors list the
-candidates. ``pose`` is a topic of ``PoseStamped``, ``PoseWithCovarianceStamped``,
-``TransformStamped`` or ``Odometry``, or ``/tf``.
-
-With ``/tf``, the pose is that of ``frame``, the camera's optical frame (by default the
-``frame_id`` of the images), in ``world`` (by default the topmost frame).
-
-A topic gives the poses of the frame that its messages name (``child_frame_id``) or ``body`` names;
-the transforms in the bag lead from that frame to the camera. Messages that name no frame are taken
-as the camera's. ``extrinsics`` is a file with the 4x4 matrix ``T_body_camera`` (metres) for what
-the bag does not know; ``none`` takes the poses as the camera's.
+candidates. ``cvo_edge.trajectories.bag_poses`` describes the options of poses.
 
 Images and poses are compared by the stamps in their headers.
 """
@@ -20,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,25 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.pose import Pose
-from cvo_edge.trajectories.poses import matrix_to_pose, read_pose_matrix
+from cvo_edge.input.bag_images import image_topic, message_size
+from cvo_edge.trajectories.bag import Bag, find_bags
+from cvo_edge.trajectories.bag_poses import OPTIONS, camera_poses
+from cvo_edge.trajectories.bag_transforms import frame_name
+from cvo_edge.trajectories.interpolation import Stamps
+from cvo_edge.trajectories.path_options import path_options
+from cvo_edge.trajectories.poses import matrix_to_pose
 from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS
-from cvo_export.datasets.bag import Bag, find_bags
-from cvo_export.datasets.bag_images import bag_camera, image_topic, message_image, message_size
-from cvo_export.datasets.bag_poses import (
-    TF,
-    Transforms,
-    frame_name,
-    pose_topic,
-    read_poses,
-)
+from cvo_export.datasets.bag_images import bag_camera, message_image
 from cvo_export.datasets.base import PoseDataset, skipped_text
-from cvo_export.datasets.folders import only_camera, path_options
+from cvo_export.datasets.folders import only_camera
 
 Array = NDArray[np.float64]
-Stamps = NDArray[np.int64]
-
-_OPTIONS = ("image", "pose", "camera", "world", "frame", "body", "extrinsics")
 
 
 class _Image(NamedTuple):
@@ -58,16 +44,6 @@ class _Image(NamedTuple):
     size: tuple[int, int]
 
 
-class _Poses(NamedTuple):
-    """``T_world_camera`` (n, 4, 4), whether a stamp was near, the world's frame, what was read."""
-
-    T: Array
-    near: NDArray[np.bool_]
-    world: str
-    text: str
-    span: str
-
-
 def open_rosbag(path: str) -> PoseDataset:
     """Read one bag, or all bags in a folder, which become sequences and must share a world frame.
 
@@ -78,7 +54,7 @@ def open_rosbag(path: str) -> PoseDataset:
     Raises UsageError for unknown options and SourceError if a bag is damaged, a topic is missing or
     ambiguous, bags have different cameras or worlds, or no frame has a pose.
     """
-    place, options = path_options("rosbag", path, _OPTIONS)
+    place, options = path_options("rosbag", path, OPTIONS)
     root = Path(place)
     images: list[_Image] = []
     poses: list[Array] = []
@@ -93,12 +69,12 @@ def open_rosbag(path: str) -> PoseDataset:
         topic = image_topic(bag, options.get("image"))
         found, stamps_ns, frame = _index(bag, topic, skipped)
         cameras[name] = bag_camera(bag, options.get("camera"), topic, frame, found[0].size)
-        frame = frame_name(options.get("frame", frame))
-        posed = _poses(bag, options, frame, stamps_ns)
+        posed = camera_poses(bag, options, partial(frame_name, frame))
         worlds[name] = posed.world
         chosen = chosen or f"images {topic}; poses {posed.text}"
-        spans.append(f"images at {_span(stamps_ns)}, poses at {posed.span}")
-        for image, stamp, T, near in zip(found, stamps_ns.tolist(), *posed[:2], strict=True):
+        spans.append(f"images at {_span(stamps_ns)}, poses at {_span(posed.span_ns)}")
+        located = posed.at(stamps_ns)
+        for image, stamp, T, near in zip(found, stamps_ns.tolist(), *located, strict=True):
             frame_id = f"{name}/{stamp // 10**9}.{stamp % 10**9:09d}"
             pose = matrix_to_pose(T) if near else None
             if not near:
@@ -151,66 +127,6 @@ def _index(bag: Bag, topic: str, skipped: Counter[str]) -> tuple[list[_Image], S
         rows.append((message.stamp_ns, place))
     rows.sort(key=lambda row: row[0])
     return [image for _, image in rows], np.array([stamp for stamp, _ in rows]), frame
-
-
-def _poses(bag: Bag, options: dict[str, str], frame: str, stamps_ns: Stamps) -> _Poses:
-    bound = MAX_STAMP_DIFFERENCE_NS
-    transforms = Transforms(bag)
-    wanted = options.get("pose", TF if "world" in options else None)
-    topic = pose_topic(bag, wanted, tf=transforms.move)
-    if topic != TF:
-        return _topic_poses(bag, topic, options, frame, stamps_ns, transforms)
-    world = frame_name(options.get("world", transforms.root(frame)))
-    T, near = transforms.between(world, frame, stamps_ns, bound)
-    if not transforms.moves(world, frame):
-        raise SourceError(
-            f"{bag.path}: expected a camera that moves, found transforms from {world} to {frame} "
-            f"that never change; name world= and frame= among {transforms.frames}"
-        )
-    text = f"{TF}, {world} to {frame}"
-    if "extrinsics" in options:
-        T, text = _with_extrinsics(T, options["extrinsics"], text)
-    return _Poses(T, near, world, text, _span(transforms.span(world, frame)))
-
-
-def _topic_poses(
-    bag: Bag,
-    topic: str,
-    options: dict[str, str],
-    frame: str,
-    stamps_ns: Stamps,
-    transforms: Transforms,
-) -> _Poses:
-    found = read_poses(bag, topic)
-    T, near = found.track.at(stamps_ns, MAX_STAMP_DIFFERENCE_NS)
-    body = frame_name(options.get("body", found.body))
-    text = f"{topic}{f' of {body}' if body else ''}"
-    if "extrinsics" in options:
-        T, text = _with_extrinsics(T, options["extrinsics"], text)
-    elif body and body != frame:
-        if not transforms.joins(body, frame):
-            raise SourceError(
-                f"{bag.path}: expected transforms from {body}, which {topic} tracks, to the camera "
-                f"{frame or '(unnamed)'}, found none; extrinsics=FILE gives the 4x4 matrix "
-                "T_body_camera, extrinsics=none takes the poses as the camera's"
-            )
-        T_body_camera, close = transforms.between(body, frame, stamps_ns, MAX_STAMP_DIFFERENCE_NS)
-        T, near, text = T @ T_body_camera, near & close, f"{text}, transformed to {frame}"
-    return _Poses(T, near, found.world, text, _span(found.track.stamps_ns))
-
-
-def _with_extrinsics(T_world_body: Array, name: str, text: str) -> tuple[Array, str]:
-    if name == "none":
-        return T_world_body, f"{text}, taken as the camera's"
-    file = Path(name)
-    if not file.is_file():
-        raise SourceError(f"{file}: expected a file with a 4x4 matrix T_body_camera, found none")
-    pose = read_pose_matrix(file)
-    if pose is None:
-        raise SourceError(
-            f"{file}: expected a 4x4 matrix T_body_camera (rotation, metres), found other text"
-        )
-    return T_world_body @ Pose.from_array(pose).to_matrix(), f"{text}, extrinsics {file.name}"
 
 
 def _read(image: _Image) -> NDArray[np.uint8]:

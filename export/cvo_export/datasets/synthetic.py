@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cvo_edge.errors import UsageError
+from cvo_edge.trajectories.path_options import read_options
 from cvo_export.datasets.base import Intrinsics, PoseDataset
-from cvo_export.datasets.folders import read_options
 from cvo_export.scene.drive import Drive
 from cvo_export.scene.flight import DEGREES_OF_FREEDOM, Flight
 from cvo_export.scene.recording import Recording

@@ -6,6 +6,7 @@ A bag is a ``.bag`` file (ROS 1), a folder with ``metadata.yaml`` (ROS 2), or a 
 
 from __future__ import annotations
 
+import os
 import threading
 import weakref
 from collections.abc import Iterator
@@ -44,9 +45,9 @@ def find_bags(root: Path) -> dict[str, Path]:
 
     Raises SourceError if there is none.
     """
-    if _is_bag(root):
+    if is_bag(root):
         return {root.resolve().stem: root}
-    found = sorted(filter(_is_bag, root.iterdir()), key=natural_key) if root.is_dir() else []
+    found = sorted(filter(is_bag, root.iterdir()), key=natural_key) if root.is_dir() else []
     if not found:
         what = "no bag in this folder" if root.is_dir() else "another file" * root.exists()
         raise SourceError(
@@ -57,8 +58,9 @@ def find_bags(root: Path) -> dict[str, Path]:
     return {path.name if stems.count(path.stem) > 1 else path.stem: path for path in found}
 
 
-def _is_bag(path: Path) -> bool:
-    if path.is_dir():
+def is_bag(path: Path) -> bool:
+    """Whether a path is that of a bag, by its name."""
+    if os.path.isdir(path):  # noqa: PTH112 - also of a name too long
         return (path / _METADATA).is_file()
     return path.suffix in _SUFFIXES and path.is_file()
 
@@ -76,7 +78,9 @@ class Bag:
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
             raise UsageError(
-                'rosbag: rosbags is not installed; pip install "cvo-export[rosbag]"'
+                f"{path}: expected the library rosbags to read a bag, found it not installed; "
+                'pip install "cvo-edge[rosbag]", or write frames and poses where it is: cvo-export '
+                f"render rosbag:{path} FOLDER"
             ) from None
         self.path = path
         with _damaged(path):
