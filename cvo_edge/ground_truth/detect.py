@@ -158,7 +158,7 @@ def _ace(part: Path) -> Trajectory[str]:
 
 
 def _tum_vi(path: Path, frames: Path) -> Found:
-    camera = _camera_of(frames)
+    camera = _camera_of(frames, "cam[0-9]+")
     folder = path.absolute().parent
     recording = folder.parent if path.name == "gt_imu.csv" else folder.parent.parent
     chain = recording / tum_vi.CAMERA
@@ -178,14 +178,14 @@ def _tum_vi(path: Path, frames: Path) -> Found:
     return interpolated(at, first_ns, last_ns, skipped, f"moved from the IMU to {camera}")
 
 
-def _camera_of(frames: Path) -> str:
+def _camera_of(frames: Path, pattern: str) -> str:
     """Return the camera of the ASL layout whose frames, or whose folder ``data``, these are."""
     names = (frames.parent.name, frames.name)
-    return next((name for name in names if re.fullmatch("cam[0-9]+", name)), "cam0")
+    return next((name for name in names if re.fullmatch(pattern, name)), "cam0")
 
 
 def _body_camera(path: Path, frames: Path) -> tuple[Array, str]:
-    camera = _camera_of(frames)
+    camera = _camera_of(frames, "cam.*")
     sensor = path.absolute().parent.parent / camera / "sensor.yaml"
     if not sensor.is_file():
         raise SourceError(

@@ -30,7 +30,7 @@ class Track(NamedTuple):
     @property
     def valid(self) -> Mask:
         """Which poses are valid (n,)."""
-        return np.asarray(np.isfinite(self.poses).all(axis=1))
+        return self._valid(slice(None))
 
     def at(self, stamps_ns: Stamps, bound_ns: int) -> tuple[Array, Mask]:
         """Return transforms (m, 4, 4) at stamps (m,), and whether the nearest is within a bound.
@@ -44,9 +44,8 @@ class Track(NamedTuple):
         near = np.minimum(np.abs(past), np.abs(left)) <= bound_ns
         span = (self.stamps_ns[after] - self.stamps_ns[before]).astype(np.float64)
         share = np.clip(past / np.where(span > 0, span, 1.0), 0.0, 1.0)[:, np.newaxis]
-        valid = self.valid
         alone = np.where(np.abs(past) <= np.abs(left), before, after)
-        both = valid[before] & valid[after]
+        both = self._valid(before) & self._valid(after)
         before, after = np.where(both, before, alone), np.where(both, after, alone)
         start, end = self.poses[before], self.poses[after]
         turn = geometry.quaternion_multiply(geometry.quaternion_conjugate(start[:, 3:]), end[:, 3:])
@@ -57,3 +56,6 @@ class Track(NamedTuple):
         T[:, :3, 3] = start[:, :3] + share * (end[:, :3] - start[:, :3])
         T[~near] = np.nan
         return T, near
+
+    def _valid(self, places: NDArray[np.int64] | slice) -> Mask:
+        return np.asarray(np.isfinite(self.poses[places]).all(axis=1))
