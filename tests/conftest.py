@@ -17,6 +17,7 @@ from hypothesis import settings
 
 from cvo_edge.bundle.format import CALIBRATION_FILE, Calibration, Threshold
 from cvo_edge.bundle.reading import encode_calibration
+from cvo_edge.engine import cores
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.heads import HEADS, Head
 from cvo_edge.vocabulary import Joint, Scope
@@ -25,6 +26,11 @@ from cvo_edge.vocabulary import Joint, Scope
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
+# A worker has a core of its own: further threads would wait, busily, for the other worker's core.
+# Its libraries read this when they are loaded.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 ROOT = Path(__file__).resolve().parent.parent
 ARTIFACTS = ROOT / "calibration_artifacts"
 
@@ -32,6 +38,14 @@ ARTIFACTS = ROOT / "calibration_artifacts"
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the files that train first, so that no core waits at the end for one that began late."""
     items.sort(key=lambda item: "export" not in item.path.relative_to(ROOT).parts)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Run models in one thread where a test asks for no number; commands use all cores."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cores, "allowed_cores", lambda: 1)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
