@@ -41,14 +41,19 @@ SMALL = {
     ("cvo-edge", "run"): ["--max-frames", "4"],
     ("cvo-edge", "bench"): ["--frames", "5", "--warmup", "1"],
     ("cvo-export", "train"): [
-        *("--weights", "none", "--size", "64x48", "--copies", "0", "--steps", "100")
+        *("--weights", "none", "--size", "64x48", "--copies", "0", "--steps", "100"),
+        *("--backbone", "test_efficientnet"),
     ],
 }
 # The video of the tutorial has few frames, all of which are used.
 SHORT = {
     **SMALL,
     ("cvo-export", "reconstruct"): ["--step", "0.001", "--tag-size", "0.3"],
-    ("cvo-export", "train"): [*SMALL["cvo-export", "train"], "--split", "random"],
+    # Intervals for another recording need features of a larger backbone.
+    ("cvo-export", "train"): [
+        *SMALL["cvo-export", "train"],
+        *("--backbone", "mobilenetv2_100", "--split", "random"),
+    ],
 }
 SCENE = "synthetic:room,flights=8,frames=12,size=64x48"
 
