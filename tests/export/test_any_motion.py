@@ -61,6 +61,7 @@ def test_a_wheeled_robot_that_turns_round_gets_sets_that_hold(tmp_path: Path) ->
     "head",
     [CqrConfig(trees=5), CspConfig(classes=8, label_sigma=4.0), McqrConfig(rays=8, directions=8)],
 )
+@pytest.mark.usefixtures("small_backbone")
 def test_other_methods_learn_full_turns_and_are_restored(tmp_path: Path, head: Any) -> None:
     config = tiny_config(dataset=_FEW, head=head, steps=6, copies=1)
     run = train(tmp_path / "run", config, ignore_progress)

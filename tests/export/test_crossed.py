@@ -4,8 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from torch import nn
-from torch.nn.functional import avg_pool2d
 
 from cvo_edge.bundle.format import CONFIDENCES
 from cvo_edge.bundle.reading import read_calibration
@@ -20,35 +18,18 @@ from cvo_export.datasets import synthetic
 from cvo_export.evaluate import evaluate, table
 from cvo_export.networks.heads.scr import ScrConfig
 from cvo_export.publish import publish
-from cvo_export.training import loop
-from cvo_export.training import run as training_run
 from cvo_export.training.loop import train
 from cvo_export.training.run import PoseGraph, load_run
 
-from .conftest import ignore_progress, tiny_config
+from .conftest import ignore_progress, thumbnails, tiny_config
 from .test_train import InterruptedTrainingError, stopping_after
 
 FOLDS, STEPS = 2, 12
 
 
-class Thumbnail(nn.Module):
-    """The image itself in 8x6 pixels: a backbone whose graphs export in a third of the time."""
-
-    size = 3 * 8 * 6
-    mean = std = (0.5, 0.5, 0.5)
-
-    def forward(self, image):
-        return avg_pool2d(image.permute(0, 3, 1, 2) / 127.5 - 1.0, 8).flatten(1)
-
-    def cells(self, features):
-        return features.unflatten(1, (3, -1)).transpose(1, 2)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _small_backbone():
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (loop, training_run):
-            patch.setattr(module, "loaded_backbone", lambda *_: (Thumbnail(), None, None))
+    with thumbnails():
         yield
 
 

@@ -278,6 +278,7 @@ def test_a_graph_that_differs_from_its_reference_is_not_published(runs, tmp_path
 @pytest.mark.parametrize(
     "changes", [{"forest": "per_dof"}, {"residuals": "held_out", "components": 0}]
 )
+@pytest.mark.usefixtures("small_backbone")
 def test_other_forests_train_and_publish(tmp_path, changes):
     head = CqrConfig(trees=5, leaf_size=4, forest_copies=0, **changes)
     run = train(tmp_path / "run", tiny_config(head=head, steps=100), ignore_progress)
@@ -413,6 +414,7 @@ def test_records_have_the_region_on_request_only(runs, tmp_path):
         assert not odometer.has_region
 
 
+@pytest.mark.usefixtures("small_backbone")
 def test_passes_are_rows_of_the_region_and_real_frames_are_what_is_counted(tmp_path, monkeypatch):
     seen = {}
     learn = training._Trainer.learn
@@ -463,6 +465,7 @@ def test_the_mean_of_many_passes_is_the_network_itself():
         {"scale": "constant", "residuals": "held_out"},
     ],
 )
+@pytest.mark.usefixtures("small_backbone")
 def test_other_regions_train_and_publish(tmp_path, changes):
     head = McqrConfig(**{"components": 4, "rays": 12, **changes})
     config = tiny_config(head=head, steps=100, copies=1)
@@ -529,12 +532,14 @@ def test_the_report_counts_classes_and_pieces(runs):
     assert all(0.0 <= share <= level["disjoint_frames"] for share in level["disjoint_share"])
 
 
+@pytest.mark.usefixtures("small_backbone")
 def test_the_papers_labels_train(tmp_path):
     head = CspConfig(classes=6, labels="one_hot")
     run = train(tmp_path / "run", tiny_config(head=head, steps=100), ignore_progress)
     assert publish(run, tmp_path / "bundle", "lac", score="lac").calibration.score == "lac"
 
 
+@pytest.mark.usefixtures("small_backbone")
 def test_val_chooses_among_widths_of_the_labels(tmp_path):
     run = train(
         tmp_path / "run", tiny_config(head=CspConfig(classes=8), steps=100), ignore_progress

@@ -144,6 +144,7 @@ def test_a_bundle_is_replaced_whole_and_anything_else_is_refused(tiny_run, tiny_
     assert [path.name for path in other.iterdir()] == ["precious.txt"]
 
 
+@pytest.mark.usefixtures("small_backbone")
 def test_sampled_latent_is_an_input_and_its_noise_a_function_of_the_frame(tmp_path):
     head = CjpConfig(latent_size=3, latent="sample")
     run = train(tmp_path / "run", tiny_config(steps=100, head=head), ignore_progress)
@@ -156,6 +157,7 @@ def test_sampled_latent_is_an_input_and_its_noise_a_function_of_the_frame(tmp_pa
     assert (a.lower != b.lower).any()
 
 
+@pytest.mark.usefixtures("small_backbone")
 def test_codebook_latent_needs_the_image_alone(tmp_path):
     head = CjpConfig(latent_size=3, latent="codebook")
     run = train(tmp_path / "run", tiny_config(steps=100, head=head), ignore_progress)
@@ -202,6 +204,7 @@ def test_members_learn_beside_each_other_as_if_alone():
     torch.testing.assert_close(loss, torch.stack(halves).mean())
 
 
+@pytest.mark.usefixtures("small_backbone")
 def test_a_run_of_several_members_becomes_a_bundle(tmp_path):
     head = CjpConfig(members=2)
     run = train(tmp_path / "run", tiny_config(steps=100, head=head), ignore_progress)
