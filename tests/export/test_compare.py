@@ -22,8 +22,9 @@ from cvo_export.study.grid import Grid
 from cvo_export.study.workers import run_tasks
 from cvo_export.training.run import load_run
 
-from .conftest import DATASET, ignore_progress
+from .conftest import ignore_progress
 
+DATASET = "synthetic:room,flights=8,frames=20,size=64x48"
 METHODS = ["split", "gaussian"]
 
 

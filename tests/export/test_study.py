@@ -20,8 +20,9 @@ from cvo_export.study.grid import expanded, plan_study, read_study, run_study
 from cvo_export.study.report import page_template, write_report
 from cvo_export.study.workers import run_tasks
 
-from .conftest import DATASET, ignore_progress
+from .conftest import ignore_progress
 
+DATASET = "synthetic:room,flights=8,frames=20,size=64x48"
 GRID = """
 [[grids]]
 data = ["$CVO_TEST_DATA"]
