@@ -193,8 +193,10 @@ def test_a_picture_shows_the_sets_that_are_evaluated(runs):
     follows = (np.diff(indices) == 1) & (np.diff(run.dataset.sequence[indices]) == 0)
     np.testing.assert_array_equal(np.diff(found.parts) == 0, follows)
     drawn = found.estimates
-    frames = evaluate(bundle, repeating, "test")["frames"]
+    report = evaluate(bundle, repeating, "test")
+    frames = report["frames"]
     assert frames["total"] == frames["bounded"] == len(drawn)
+    assert found.proven == find_level(report["levels"], 0.9, "marginal")["statement"]
     assert all(np.isfinite(estimate.lower).all() for estimate in drawn)
 
 

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_export.plot import BAND, BOXES, MISSED, POINT, TRUTH, Track, draw_dof, draw_from_above
+from cvo_export.plot import (
+    BAND,
+    BOXES,
+    MISSED,
+    POINT,
+    TRUTH,
+    Track,
+    draw_bands,
+    draw_dof,
+    draw_from_above,
+    set_title,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,6 +31,8 @@ Array = NDArray[np.float64]
 # A palette for colour-blind readers (Okabe and Ito 2008).
 _LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _COLUMNS = 4
+# Characters in a line of the title of a method's panel.
+_TITLE_COLUMNS = 42
 # More boxes would hide the flight.
 _TUBE_BOXES = 25
 # Fraction of the flight's extent: smaller boxes are indistinguishable from the line.
@@ -42,10 +55,13 @@ def comparison(tracks: Mapping[str, Track]) -> Figure:
         _draw_about_truth(axes[1, column], track, reach)
         draw_from_above(axes[2, column], track)
         _draw_plane_about_truth(axes[3, column], track, reach)
-        axes[0, column].set_title(method)
-        # Use one scale for all methods so that widths are comparable.
-        axes[0, column].set_ylim(axes[0, 0].get_ylim())
+        notes = axes[0, column].get_title().splitlines()
+        set_title(axes[0, column], [method, *notes], _TITLE_COLUMNS)
         axes[2, column].set_title("")
+    # Use one scale for all methods so that widths are comparable.
+    limits = np.array([panel.get_ylim() for panel in axes[0]])
+    for panel in axes[0]:
+        panel.set_ylim(limits[:, 0].min(), limits[:, 1].max())
     return figure
 
 
@@ -59,18 +75,18 @@ def _usual_reach(track: Track) -> float:
 
 def _draw_about_truth(axes: Axes, track: Track, reach: float) -> None:
     """Draw the set of x minus the truth over the frames, in centimetres."""
-    places, bottoms, heights, missed = [], [], [], []
+    places: list[int] = []
+    ends: list[Array] = []
+    missed = []
     for row in track.rows:
         estimate, truth = track.estimates[row], track.truth[row, 0]
         bands = estimate.bands[0] if estimate.bands else ((estimate.lower[0], estimate.upper[0]),)
         for band in bands:
-            low, high = np.clip(100.0 * (np.array(band) - truth), -reach, reach)
             places.append(row)
-            bottoms.append(low)
-            heights.append(high - low)
+            ends.append(100.0 * (np.array(band) - truth))
         if not estimate.conformal_set.covers(track.truth[row])[0]:
             missed.append(row)
-    axes.bar(places, heights, 1.0, bottoms, color=BAND, alpha=0.8, linewidth=0)
+    draw_bands(axes, places, ends, (-reach, reach))
     axes.axhline(0.0, color=TRUTH, linewidth=0.9)
     axes.plot(missed, np.zeros(len(missed)), "x", color=MISSED, markersize=5)
     axes.set_ylim(-reach, reach)
