@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from cvo_edge.camera import LEAST_SIDE, Camera
+from cvo_edge.documents import one_line, shown
 from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.pose import Rotation
 from cvo_edge.vocabulary import Crop, Joint, Precision, Provider, Rule, Scope, SplitKind
@@ -342,14 +343,3 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
             return msgspec.convert(self.method_parameters, kind, strict=True)
         except msgspec.ValidationError as error:
             raise CalibrationFileError(f"method_parameters: {one_line(str(error))}") from None
-
-
-def shown(value: object) -> str:
-    """Return the repr of a value as one line of bounded length, for an error message."""
-    return one_line(repr(value))
-
-
-def one_line(text: str) -> str:
-    """Return a text as one line of at most 160 characters."""
-    line = " ".join(text.split())
-    return line if len(line) <= 160 else line[:157] + "..."

@@ -12,8 +12,8 @@ from cvo_edge.bundle.format import (
     SixOrUnbounded,
     TensorSpec,
     Threshold,
-    shown,
 )
+from cvo_edge.documents import shown
 from cvo_edge.errors import CalibrationFileError
 
 

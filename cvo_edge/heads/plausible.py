@@ -18,9 +18,9 @@ from cvo_edge.bundle.format import (
     Calibration,
     CalibrationSpec,
     Threshold,
-    shown,
 )
 from cvo_edge.conformal import least_draws, recording_cap
+from cvo_edge.documents import shown
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads import Head
 from cvo_edge.input.view import crop_view, seen_camera

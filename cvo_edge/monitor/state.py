@@ -15,7 +15,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from cvo_edge.bundle.format import Calibration, Sha256, one_line
+from cvo_edge.bundle.format import Calibration, Sha256
+from cvo_edge.documents import one_line
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, SinkError
 from cvo_edge.files import read_regular_file, write_whole
 from cvo_edge.vocabulary import Scope

@@ -34,8 +34,8 @@ from cvo_edge.bundle.format import (
     SplitSpec,
     Threshold,
 )
-from cvo_edge.bundle.reading import UNWRITTEN
 from cvo_edge.camera import Camera
+from cvo_edge.documents import UNWRITTEN
 from cvo_edge.engine.observation import Observer
 from cvo_edge.engine.session import Session
 from cvo_edge.heads import HEADS, Candidate, Head
