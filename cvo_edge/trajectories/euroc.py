@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.trajectories.poses import (
     camera_pose,
-    quaternion_fault,
-    quaternion_pose,
+    quaternion_poses,
     rigid_transform,
 )
 from cvo_edge.trajectories.tables import read_rows, read_text
@@ -37,13 +36,15 @@ def read_euroc(path: Path, T_body_camera: NDArray[np.float64]) -> Trajectory[int
 
     Raises SourceError if the file cannot be read, a line is malformed, or no pose is valid.
     """
-    entries = []
-    for row in read_rows(path, FORM, separator=",", more=True):
-        numbers = row.numbers(1)
-        position_m, q_xyzw = numbers[:3], np.roll(numbers[3:], -1)
-        fault = quaternion_fault(position_m, q_xyzw)
-        pose = camera_pose(quaternion_pose(position_m, q_xyzw), T_body_camera)
-        entries.append(Entry(row.nanoseconds(), pose, row.where, fault))
+    rows = read_rows(path, FORM, separator=",", more=True)
+    numbers = np.array([row.numbers(1) for row in rows]).reshape(len(rows), -1)
+    poses, faults = quaternion_poses(numbers[:, :3], np.roll(numbers[:, 3:], -1, axis=1))
+    if not np.array_equal(T_body_camera, np.eye(4)):
+        poses = [camera_pose(pose, T_body_camera) for pose in poses]
+    entries = [
+        Entry(row.nanoseconds(), pose, row.where, fault or None)
+        for row, pose, fault in zip(rows, poses, faults, strict=True)
+    ]
     return trajectory_of(path, sorted(entries, key=lambda entry: entry.key))
 
 

@@ -35,8 +35,20 @@ class Track(NamedTuple):
     def at(self, stamps_ns: Stamps, bound_ns: int) -> tuple[Array, Mask]:
         """Return transforms (m, 4, 4) at stamps (m,), and whether the nearest is within a bound.
 
-        Beside an invalid pose, the nearest one counts alone. Transforms are NaN beyond the bound
-        and where the nearest pose is invalid.
+        As ``poses_at``.
+        """
+        poses, near = self.poses_at(stamps_ns, bound_ns)
+        T = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
+        T[:, :3, :3] = geometry.quaternion_to_matrix(poses[:, 3:])
+        T[:, :3, 3] = poses[:, :3]
+        T[~near] = np.nan
+        return T, near
+
+    def poses_at(self, stamps_ns: Stamps, bound_ns: int) -> tuple[Array, Mask]:
+        """Return poses (m, 7) at stamps (m,), and whether the nearest is within a bound.
+
+        Beside an invalid pose, the nearest one counts alone. Poses are NaN beyond the bound and
+        where the nearest pose is invalid.
         """
         after = np.searchsorted(self.stamps_ns, stamps_ns).clip(0, len(self.stamps_ns) - 1)
         before = np.where(self.stamps_ns[after] > stamps_ns, np.maximum(after - 1, 0), after)
@@ -50,12 +62,11 @@ class Track(NamedTuple):
         start, end = self.poses[before], self.poses[after]
         turn = geometry.quaternion_multiply(geometry.quaternion_conjugate(start[:, 3:]), end[:, 3:])
         step = geometry.quaternion_exp(share * geometry.quaternion_log(turn))
-        q = geometry.quaternion_multiply(start[:, 3:], step)
-        T = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
-        T[:, :3, :3] = geometry.quaternion_to_matrix(q)
-        T[:, :3, 3] = start[:, :3] + share * (end[:, :3] - start[:, :3])
-        T[~near] = np.nan
-        return T, near
+        q = geometry.quaternion_normalise(geometry.quaternion_multiply(start[:, 3:], step))
+        t_m = start[:, :3] + share * (end[:, :3] - start[:, :3])
+        poses = np.concatenate([t_m, q], axis=1)
+        poses[~near] = np.nan
+        return poses, near
 
     def _valid(self, places: NDArray[np.int64] | slice) -> Mask:
         return np.asarray(np.isfinite(self.poses[places]).all(axis=1))

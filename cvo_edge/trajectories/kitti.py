@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.trajectories.poses import camera_pose, matrix_fault, matrix_to_pose
+from cvo_edge.trajectories.poses import camera_pose, matrices_to_poses
 from cvo_edge.trajectories.tables import read_rows
 from cvo_edge.trajectories.trajectory import Entry, Trajectory, trajectory_of
 
@@ -37,12 +37,19 @@ def read_kitti(path: Path, T_camera0_camera: Array) -> Trajectory[int]:
 
     Raises SourceError if the file cannot be read, a line is malformed, or no pose is valid.
     """
-    entries = []
-    for number, row in enumerate(read_rows(path, FORM, comments=False)):
-        T = np.vstack([row.numbers().reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-        pose = camera_pose(matrix_to_pose(T), T_camera0_camera)
-        entries.append(Entry(number, pose, row.where, matrix_fault(T)))
-    return trajectory_of(path, entries)
+    rows = read_rows(path, FORM, comments=False)
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3] = np.array([row.numbers() for row in rows]).reshape(-1, 3, 4)
+    poses, faults = matrices_to_poses(T)
+    if not np.array_equal(T_camera0_camera, np.eye(4)):
+        poses = [camera_pose(pose, T_camera0_camera) for pose in poses]
+    return trajectory_of(
+        path,
+        [
+            Entry(number, pose, row.where, fault or None)
+            for number, (pose, row, fault) in enumerate(zip(poses, rows, faults, strict=True))
+        ],
+    )
 
 
 def read_calibration(path: Path, camera: int) -> tuple[Array, Array]:

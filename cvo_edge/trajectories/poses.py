@@ -20,6 +20,7 @@ _MAX_MATRIX_BYTES = 1 << 16
 
 # Files round quaternions and matrices to a few digits.
 _TOLERANCE = 0.01
+_LAST_ROW = 1e-6
 # Further away than the moon: no coordinates of a place. Networks' outputs have the same limit.
 _FARTHEST_M = 1e9
 
@@ -33,6 +34,22 @@ def quaternion_pose(position_m: Array, q_xyzw: Array) -> Array | None:
     if quaternion_fault(position_m, q_xyzw) is not None:
         return None
     return np.concatenate([position_m, geometry.quaternion_normalise(q_xyzw)])
+
+
+def quaternion_poses(positions_m: Array, q_xyzw: Array) -> tuple[list[Array | None], list[str]]:
+    """Do the same for positions (n, 3) and quaternions (n, 4); faults are "" for valid poses."""
+    with np.errstate(all="ignore"):
+        norms = np.linalg.norm(q_xyzw, axis=1)
+        valid = (np.abs(norms - 1.0) <= _TOLERANCE) & (np.abs(positions_m) < _FARTHEST_M).all(
+            axis=1
+        )
+        every = np.concatenate([positions_m, geometry.quaternion_normalise(q_xyzw)], axis=1)
+    poses = [pose if fine else None for pose, fine in zip(every, valid.tolist(), strict=True)]
+    faults = [
+        "" if fine else quaternion_fault(position_m, q) or ""
+        for position_m, q, fine in zip(positions_m, q_xyzw, valid.tolist(), strict=True)
+    ]
+    return poses, faults
 
 
 def quaternion_fault(position_m: Array, q_xyzw: Array) -> str | None:
@@ -73,6 +90,24 @@ def matrix_to_pose(T: Array) -> Array | None:
     return np.concatenate([T[:3, 3], geometry.matrix_to_quaternion(R)])
 
 
+def matrices_to_poses(T: Array) -> tuple[list[Array | None], list[str]]:
+    """Do the same for matrices (n, 4, 4); faults are "" for valid ones."""
+    whole = np.asarray(np.isfinite(T).all(axis=(1, 2)))
+    R = geometry.nearest_rotation(np.where(whole[:, np.newaxis, np.newaxis], T, 0.0)[:, :3, :3])
+    every = np.concatenate([T[:, :3, 3], geometry.matrix_to_quaternion(R)], axis=1)
+    with np.errstate(invalid="ignore"):
+        off = np.abs(R - T[:, :3, :3]).max(axis=(1, 2))
+        near = (np.abs(T[:, :3, 3]) < _FARTHEST_M).all(axis=1)
+        valid = whole & near & (off <= _TOLERANCE)
+    valid &= np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) <= _LAST_ROW
+    poses = [pose if fine else None for pose, fine in zip(every, valid.tolist(), strict=True)]
+    faults = [
+        "" if fine else matrix_fault(each) or ""
+        for each, fine in zip(T, valid.tolist(), strict=True)
+    ]
+    return poses, faults
+
+
 def matrix_fault(T: Array) -> str | None:
     """Return why a matrix (4, 4) is no pose, or None."""
     if not np.isfinite(T).all():
@@ -82,7 +117,9 @@ def matrix_fault(T: Array) -> str | None:
     off = float(np.abs(geometry.nearest_rotation(T[:3, :3]) - T[:3, :3]).max())
     if off > _TOLERANCE:
         return f"a matrix {off:.3g} away from a rotation"
-    return None if np.abs(T[3] - [0, 0, 0, 1]).max() <= 1e-6 else "a last row other than 0 0 0 1"
+    if np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() > _LAST_ROW:
+        return "a last row other than 0 0 0 1"
+    return None
 
 
 def rigid_transform(path: Path, key: str, text: str | None) -> Array:

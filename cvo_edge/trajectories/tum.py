@@ -23,9 +23,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cvo_edge.trajectories.poses import quaternion_fault, quaternion_pose
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.trajectories.poses import quaternion_poses
 from cvo_edge.trajectories.tables import read_rows
 from cvo_edge.trajectories.trajectory import Entry, Trajectory, trajectory_of
+
+Array = NDArray[np.float64]
 
 FORM = "timestamp tx ty tz qx qy qz qw"
 
@@ -38,11 +43,21 @@ def read_tum(path: Path) -> Trajectory[int]:
 
     Raises SourceError if the file cannot be read, a line is malformed, or no pose is valid.
     """
-    entries = []
-    for row in read_rows(path, FORM):
-        numbers = row.numbers(1)
-        position_m, q_xyzw = numbers[:3], numbers[3:]
-        fault = quaternion_fault(position_m, q_xyzw)
-        pose = quaternion_pose(position_m, q_xyzw)
-        entries.append(Entry(row.seconds(), pose, row.where, fault))
-    return trajectory_of(path, sorted(entries, key=lambda entry: entry.key))
+    return read_tum_columns(path, FORM)[0]
+
+
+def read_tum_columns(path: Path, form: str) -> tuple[Trajectory[int], Array]:
+    """Read a file whose ``form`` has more columns than ``FORM``, and these columns (n, c).
+
+    Raises as ``read_tum``.
+    """
+    rows = read_rows(path, form)
+    stamps = [row.seconds() for row in rows]
+    numbers = np.array([row.numbers(1) for row in rows]).reshape(len(rows), -1)
+    poses, faults = quaternion_poses(numbers[:, :3], numbers[:, 3:7])
+    order = sorted(range(len(rows)), key=stamps.__getitem__)
+    entries = [Entry(stamps[k], poses[k], rows[k].where, faults[k] or None) for k in order]
+    # Of rows with one stamp, the first counts, as in ``trajectory_of``.
+    first = {stamps[k]: k for k in reversed(order)}
+    trajectory = trajectory_of(path, entries)
+    return trajectory, numbers[[first[key] for key in trajectory.keys], 7:]
