@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import io
-import os
-import select
-import stat
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
-from cvo_edge.errors import SinkError, UsageError
+from cvo_edge.errors import UsageError
 from cvo_edge.estimate import BandsOrUnbounded, PoseInterval
+from cvo_edge.output.lines import LineFile
 from cvo_edge.output.records import Header
 from cvo_edge.output.table import table_heading, table_line
 from cvo_edge.vocabulary import Format
+
+Array = NDArray[np.float64]
 
 _SUFFIXES: dict[str, Format] = {".jsonl": "jsonl", ".csv": "csv", ".tum": "tum"}
 _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
@@ -58,8 +58,7 @@ class Sink:
     Raises
     ------
     SinkError
-        The file cannot be opened or, later, written. Complete lines are kept; an incomplete line is
-        removed from a regular file.
+        As ``LineFile``.
     UsageError
         The format cannot hold a region.
     """
@@ -73,32 +72,7 @@ class Sink:
         self._heading, self._line = _FORMATS[format]
         if region:
             self._line = _json_line_with_region
-        self._owned = path != "-"
-        self._name = path if self._owned else "standard output"
-        self._started = False
-        try:
-            self._descriptor = (
-                os.open(path, os.O_WRONLY | os.O_CREAT, 0o666)
-                if self._owned
-                else sys.stdout.fileno()
-            )
-            self._alone()
-        except OSError as error:
-            raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
-
-    def _alone(self) -> None:
-        """Lock a regular file against a second writer; the lock ends with the process."""
-        if not self._owned or not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
-            return
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(self._descriptor)
-            raise SinkError(
-                f"{self._name}: another run is writing to this file; choose another output"
-            ) from None
-        except OSError:
-            return  # the file system does not support locks
+        self._lines = LineFile(path)
 
     def __enter__(self) -> Sink:
         """Return itself."""
@@ -111,8 +85,7 @@ class Sink:
         traceback: TracebackType | None,
     ) -> None:
         """Close the file, if it is one."""
-        if self._owned:
-            os.close(self._descriptor)
+        self._lines.__exit__(kind, error, traceback)
 
     def write(self, estimate: PoseInterval) -> None:
         """Write one estimate.
@@ -121,40 +94,9 @@ class Sink:
         UsageError for a TUM line without a stamp.
         """
         line = self._line(estimate)
-        if not self._started:
-            self._started = True
-            # Keep the old contents until the first new line is ready.
-            if self._owned and stat.S_ISREG(os.fstat(self._descriptor).st_mode):
-                os.ftruncate(self._descriptor, 0)
+        if not self._lines.started:
             line = self._heading(self._header, estimate) + line
-        self._put(line)
-
-    def _put(self, line: bytes) -> None:
-        written = 0
-        while written < len(line):
-            try:
-                written += os.write(self._descriptor, line[written:] if written else line)
-            except BrokenPipeError:
-                raise
-            except BlockingIOError:
-                # Another process made this pipe non-blocking; wait until it accepts data.
-                reader = select.poll()
-                reader.register(self._descriptor, select.POLLOUT)
-                reader.poll()
-            except OSError as error:
-                self._take_back(written)
-                raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
-
-    def _take_back(self, written: int) -> None:
-        """Remove an incomplete line from a regular file."""
-        found = os.fstat(self._descriptor)
-        if not written or not stat.S_ISREG(found.st_mode):
-            return
-        end = os.lseek(self._descriptor, 0, os.SEEK_CUR)
-        # Truncate only if nothing follows the incomplete line.
-        if end == found.st_size:
-            os.ftruncate(self._descriptor, end - written)
-            os.lseek(self._descriptor, end - written, os.SEEK_SET)
+        self._lines.write(line)
 
 
 def _json_heading(header: Header | None, _: PoseInterval) -> bytes:
@@ -233,9 +175,14 @@ def _tum_line(estimate: PoseInterval) -> bytes:
             f"tum: expected a stamp for every frame, {estimate.source or f'frame {estimate.seq}'} "
             "has none; give --fps"
         )
-    seconds, rest = divmod(abs(estimate.stamp_ns), 1_000_000_000)
-    sign = "-" if estimate.stamp_ns < 0 else ""
-    numbers = " ".join(f"{value:.9f}" for value in estimate.pose.to_array().tolist())
+    return tum_line(estimate.stamp_ns, estimate.pose.to_array())
+
+
+def tum_line(stamp_ns: int, pose: Array) -> bytes:
+    """Return the line of a pose (7,): seconds, tx ty tz, qx qy qz qw."""
+    seconds, rest = divmod(abs(stamp_ns), 1_000_000_000)
+    sign = "-" if stamp_ns < 0 else ""
+    numbers = " ".join(f"{value:.9f}" for value in pose.tolist())
     return f"{sign}{seconds}.{rest:09d} {numbers}\n".encode()
 
 
