@@ -37,18 +37,11 @@ from cvo_edge.engine.observation import Observation
 from cvo_edge.errors import UsageError
 from cvo_edge.heads import Head
 from cvo_edge.monitor.state import State, StateFile
+from cvo_edge.monitor.steps import LARGEST, MOST_STALE, step
 from cvo_edge.pose import Chart, Pose, about
 
 Array = NDArray[np.float64]
 
-ETA, RARE_ETA = 0.3, 0.5
-# With more frames than this from one label to the next, labels are rare.
-_RARE = 20
-# Scores within a factor of 1,000 of the calibrated threshold are those that the bound is about.
-_REACH = math.log(1000.0)
-# Labels under way move x by at most 1, and the last one by at most RARE_ETA.
-MOST_STALE = 1.0 + RARE_ETA
-_LARGEST = _REACH + MOST_STALE
 # Frames that can still be labelled.
 KEPT = 1024
 # The unit of shifts: from the median to the last level at or below this one.
@@ -338,7 +331,7 @@ class Adaptation:
 
     def _limits(self) -> tuple[Array, Array]:
         """Return the range of x: beyond it, thresholds would leave the range of the score."""
-        least, most = np.full(self._q.shape, -_LARGEST), np.full(self._q.shape, _LARGEST)
+        least, most = np.full(self._q.shape, -LARGEST), np.full(self._q.shape, LARGEST)
         if self._shifts:
             lowest, highest = self._range
             with np.errstate(invalid="ignore", divide="ignore"):
@@ -347,23 +340,6 @@ class Adaptation:
         if self._joint:
             return least[self._moves].min(keepdims=True), most[self._moves].max(keepdims=True)
         return least, most
-
-
-def step(gap: int, delay: int) -> float:
-    """Return eta for a label ``gap`` frames after the one before and ``delay`` frames late."""
-    eta = RARE_ETA if gap > _RARE else ETA
-    return min(eta, gap / delay) if delay else eta
-
-
-def error_bound(labels: int, eta: float, under_way: float) -> float:
-    """Return the bound on |share of labelled frames that were missed - alpha|.
-
-    It is (13.8 + (1 + d) eta) / (eta T) for T ``labels`` with the step ``eta`` (the first may have
-    a smaller one), of which d = ``under_way`` are given before the first of them arrives; 13.8 =
-    2 ln 1000. The scores of labelled frames must lie within a factor of 1,000 of the calibrated
-    threshold (or seven units).
-    """
-    return (2.0 * _REACH + (1.0 + under_way) * eta) / (eta * labels)
 
 
 def _sides(threshold: Threshold) -> Array:

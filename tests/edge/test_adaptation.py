@@ -19,8 +19,9 @@ from cvo_edge.bundle.format import CONFIDENCES, Threshold
 from cvo_edge.engine.observation import Observation
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, SinkError
 from cvo_edge.ground_truth import open_ground_truth
-from cvo_edge.monitor.adaptation import KEPT, Adaptation, error_bound
+from cvo_edge.monitor.adaptation import KEPT, Adaptation
 from cvo_edge.monitor.state import State, StateFile
+from cvo_edge.monitor.steps import error_bound
 from cvo_edge.pose import Chart
 from cvo_edge.programs.cli import app
 from cvo_edge.programs.options import MOST_DELAY

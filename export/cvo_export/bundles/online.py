@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from cvo_edge.bundle.format import Calibration
 from cvo_edge.engine.observation import Observation
 from cvo_edge.errors import UsageError
-from cvo_edge.monitor.adaptation import KEPT, Adaptation, error_bound, step
+from cvo_edge.monitor.adaptation import KEPT, Adaptation
+from cvo_edge.monitor.steps import error_bound, step
 from cvo_edge.odometer import Odometer
 from cvo_edge.vocabulary import SCOPES, Scope
 from cvo_export.bundles.observed import Observed
