@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from cvo_edge.estimate import PoseInterval, Reason, Record, Status
     from cvo_edge.input.frame import Frame
     from cvo_edge.input.sources import open_source
+    from cvo_edge.motion.intervals import MotionCalibration
+    from cvo_edge.motion.records import MotionInterval, MotionReason, MotionRecord
+    from cvo_edge.motion.tracker import MotionTracker
     from cvo_edge.odometer import Odometer
     from cvo_edge.output.records import Header, Records, read_records
     from cvo_edge.pose import Chart, Pose
@@ -54,6 +57,11 @@ __all__ = [
     "Header",
     "ModelCache",
     "ModelError",
+    "MotionCalibration",
+    "MotionInterval",
+    "MotionReason",
+    "MotionRecord",
+    "MotionTracker",
     "Odometer",
     "Pose",
     "PoseInterval",
@@ -85,6 +93,11 @@ _HOMES = {
     "Header": "output.records",
     "ModelCache": "engine.model_cache",
     "ModelError": "errors",
+    "MotionCalibration": "motion.intervals",
+    "MotionInterval": "motion.records",
+    "MotionReason": "motion.records",
+    "MotionRecord": "motion.records",
+    "MotionTracker": "motion.tracker",
     "Odometer": "odometer",
     "Pose": "pose",
     "PoseInterval": "estimate",

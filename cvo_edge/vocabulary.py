@@ -19,7 +19,14 @@ Provider = Literal["onnxruntime", "openvino"]
 Sides = Literal["symmetric", "asymmetric", "lower", "upper"]
 Joint = Literal["max", "bonferroni"]
 Rule = Literal["pooled", "capped", "hierarchical"]
+TrajectoryFormat = Literal["tum", "kitti", "euroc", "openvins"]
+MotionFormat = Literal["jsonl", "csv", "tum"]
+MotionCovariance = Literal["interval", "integrated"]
+MotionCorrection = Literal["time", "frame", "scale"]
+MotionRule = Literal["mean", "tolerance", "capped", "hierarchical"]
 SplitKind = Literal["random", "block", "sequence"]
 
+MOTION_CORRECTIONS: tuple[MotionCorrection, ...] = get_args(MotionCorrection)
+MOTION_RULES: tuple[MotionRule, ...] = get_args(MotionRule)
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 MODES: tuple[Mode, ...] = get_args(Mode)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -44,11 +44,16 @@ def inspect(bundle: BundleArgument, as_json: JsonOption = False) -> None:
         print(*inspect_lines(calibration), sep="\n")
 
 
-def schema() -> None:
-    """Print the JSON Schema of calibration.json."""
-    from cvo_edge.programs.inspect import calibration_schema
+def schema(
+    file: Annotated[
+        Literal["calibration", "motion"],
+        typer.Argument(help="calibration.json or motion.json."),
+    ] = "calibration",
+) -> None:
+    """Print the JSON Schema of calibration.json or motion.json."""
+    from cvo_edge.programs.inspect import calibration_schema, motion_schema
 
-    print(json.dumps(calibration_schema(), indent=1))
+    print(json.dumps(calibration_schema() if file == "calibration" else motion_schema(), indent=1))
 
 
 def doctor(as_json: JsonOption = False) -> None:

@@ -239,6 +239,20 @@ def calibration_schema() -> dict[str, Any]:
     }
 
 
+def motion_schema() -> dict[str, Any]:
+    """Return the JSON Schema of ``motion.json``."""
+    from cvo_edge.motion.format import MotionFile
+
+    (document,), components = msgspec.json.schema_components(
+        [MotionFile], ref_template="#/$defs/{name}"
+    )
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **document,
+        "$defs": components,
+    }
+
+
 def _number(value: float) -> str:
     """Return a number in at most nine characters, so that columns stay apart."""
     return f"{value:.5f}" if value < 999.5 else f"{value:.6g}"

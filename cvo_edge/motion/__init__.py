@@ -1,0 +1,1 @@
+"""Intervals on the relative motion of any estimator, from pairs of trajectories."""

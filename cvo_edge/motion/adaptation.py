@@ -1,0 +1,79 @@
+"""Thresholds on motion that follow true poses which come late, or only now and then.
+
+The rule is that of ``monitor.adaptation``: for each horizon and each of its errors, with each
+motion whose truth becomes known
+
+    x <- x + eta (1{s > used} - alpha),    threshold = calibrated threshold exp(x)
+
+where ``used`` is the threshold at the time of that motion. In the joint scope, the six degrees of
+freedom count as one. eta is at most 1 over the number of labels under way, and no label moves x
+further than ``MOST_STALE`` from the x of its own motion. What holds is the share of labelled
+motions that are inside in the long run, not this moment.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.monitor.steps import LARGEST, MOST_STALE, step
+
+Array = NDArray[np.float64]
+
+# Labels older than so many changes of x are refused.
+_KEPT = 4096
+
+
+class MotionAdaptation:
+    """x of each of the eight errors of one horizon, over the rows of a stream.
+
+    Parameters
+    ----------
+    alpha
+        The miscoverage to reach.
+    joint
+        Whether the six degrees of freedom count as one.
+    """
+
+    def __init__(self, alpha: float, *, joint: bool) -> None:
+        self._alpha = alpha
+        self._joint = joint
+        # From which row on each x is used, ascending.
+        self._since = [0]
+        self._x = [np.zeros(8)]
+        self._last: int | None = None
+
+    @property
+    def x(self) -> Array:
+        """X (8,) for the next row."""
+        return self._x[-1]
+
+    def at(self, seq: int) -> Array | None:
+        """Return x (8,) as it was for a row; None if that is too long ago."""
+        place = bisect_right(self._since, seq) - 1
+        return self._x[place] if place >= 0 else None
+
+    def update(self, seq: int, newest: int, scores: Array) -> NDArray[np.bool_] | None:
+        """Take the scores (8,) of the motion that ended at row ``seq``, over calibrated thresholds.
+
+        ``newest`` is the number of the last row. Returns what was covered, (8,); None if the motion
+        is too long ago.
+        """
+        own = self.at(seq)
+        if own is None:
+            return None
+        missed = scores > np.exp(own)
+        counted = missed.astype(np.float64)
+        if self._joint:
+            counted[:6] = missed[:6].any()
+        gap = 1 if self._last is None or seq <= self._last else seq - self._last
+        x = self.x + step(gap, newest - seq) * (counted - self._alpha)
+        x = np.clip(x, np.minimum(self.x, own - MOST_STALE), np.maximum(self.x, own + MOST_STALE))
+        self._x.append(np.clip(x, -LARGEST, LARGEST))
+        self._since.append(newest + 1)
+        self._last = max(seq, self._last or 0)
+        if len(self._x) > _KEPT:
+            del self._x[0], self._since[0]
+        return ~missed

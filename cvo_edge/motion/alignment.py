@@ -1,0 +1,283 @@
+"""How two trajectories of one drive fit together: time offset, body frames, scale.
+
+Public pairs of an estimate and a ground truth are often off by a frame or by a degree. Such a fault
+widens all intervals, and it is not the estimator's. With the motions dE of the estimate and dG of
+the truth over half a second, as rotation vectors w and translations t,
+
+    w_G = R w_E,    t_G = s R t_E
+
+for body frames that differ by a rotation R and a scale s, up to noise. For each time offset of the
+truth, R and s follow by least squares on the 80 % of motions that fit best: R from the solution of
+Wahba's problem by SVD (Markley 1988), then from Gauss-Newton steps. The offset is where the noise
+is least: the vertex of a parabola through its square at three offsets.
+
+Standard errors are those of a jackknife over ten blocks of the drive. Straight motion says nothing
+about the rotation about its own direction: about an axis with a standard error of more than half a
+degree, the rotation is undetermined.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cvo_edge import geometry
+from cvo_edge.motion.horizons import Horizon, path_length, starts
+from cvo_edge.motion.relative import motion
+from cvo_edge.trajectories.interpolation import Track
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+# Largest offset that is looked for.
+MOST_OFFSET_S = 1.0
+# Standard error (deg) from which on a rotation about an axis is undetermined.
+UNDETERMINED_DEG = 0.5
+_SPAN = Horizon("s", 0.5)
+_KEPT = 0.8
+_BLOCKS = 10
+_STEPS = 6
+# With fewer motions than this, nothing is found.
+LEAST_MOTIONS = 50
+_MOST_MOTIONS = 2000
+_MOST_COARSE = 400
+_LEAST_NOISE = 1e-9
+
+
+class Alignment(NamedTuple):
+    """What was found of one pair, with standard errors.
+
+    Attributes
+    ----------
+    offset_s, offset_error_s
+        To be added to the estimate's stamps to give the truth's.
+    rotation, rotation_error_deg
+        Rotation vector (3,) of R in rad, from the estimate's body frame to the truth's, and the
+        standard errors (3,) about the ``axes``, ascending.
+    axes
+        Unit vectors (3, 3), one a row, in the estimate's body frame.
+    scale, scale_error
+        The estimate's translations times this are the truth's.
+    """
+
+    offset_s: float
+    offset_error_s: float
+    rotation: Array
+    rotation_error_deg: Array
+    axes: Array
+    scale: float
+    scale_error: float
+
+    @property
+    def undetermined(self) -> Array:
+        """The axes (k, 3) about which the rotation is undetermined."""
+        return self.axes[self.rotation_error_deg > UNDETERMINED_DEG]
+
+    @property
+    def determined_rotation(self) -> Array:
+        """The rotation vector (3,), rad, without its parts about undetermined axes."""
+        known = self.axes[self.rotation_error_deg <= UNDETERMINED_DEG]
+        return np.asarray(known.T @ (known @ self.rotation))
+
+
+class _Twists(NamedTuple):
+    """Rotation vectors and translations, (n, 3) each, of the same motions."""
+
+    w: Array
+    t: Array
+
+    @property
+    def known(self) -> Mask:
+        return np.asarray(np.isfinite(self.w).all(axis=1))
+
+    def taken(self, which: Mask) -> _Twists:
+        return _Twists(self.w[which], self.t[which])
+
+
+class _Solution(NamedTuple):
+    """R (3, 3), the scale, and the noise of rotations (rad) and translations (m)."""
+
+    R: Array
+    scale: float
+    noise: Array
+
+
+def align(stamps_ns: Integers, estimate: Array, truth: Track) -> Alignment | None:
+    """Compare an estimate with a truth; None if too few motions overlap or nothing moves.
+
+    Parameters
+    ----------
+    stamps_ns, estimate
+        Shape (n,), ascending, and (n, 7), NaN where there is no pose.
+    truth
+        The truth at its own stamps.
+    """
+    if len(stamps_ns) < LEAST_MOTIONS or len(truth.stamps_ns) < LEAST_MOTIONS:
+        return None
+    pair = _Pair(stamps_ns, estimate, truth)
+    offset_ns = pair.coarse_offset()
+    if offset_ns is None:
+        return None
+    trues = [pair.truth_at(offset_ns + k * pair.step_ns) for k in (-1, 0, 1)]
+    known = trues[0].known & trues[1].known & trues[2].known
+    block = np.arange(len(known)) * _BLOCKS // len(known)
+    vertices = [
+        _vertex(pair.moved, trues, known & (block != left_out)) for left_out in range(-1, _BLOCKS)
+    ]
+    whole = [each for each in vertices if each is not None]
+    if len(whole) < len(vertices):
+        return None
+    found, *others = whole
+    # At the vertex itself; those of the blocks only measure how much they differ.
+    offset_ns += found.shift * pair.step_ns
+    true = pair.truth_at(offset_ns)
+    known = true.known
+    best = _solve(pair.moved.taken(known), true.taken(known))
+    turns = _logarithms(np.array([each.solution.R @ best.R.T for each in others]))
+    # Rotations of the truth's body frame, seen from the estimate's.
+    variances, axes = np.linalg.eigh(_jackknife(turns @ best.R))
+    deviation = np.sqrt(np.maximum(variances, 0.0))
+    return Alignment(
+        1e-9 * offset_ns,
+        1e-9 * pair.step_ns * float(np.sqrt(_jackknife([each.shift for each in others])[0, 0])),
+        _logarithms(best.R[np.newaxis])[0],
+        np.rad2deg(deviation),
+        axes.T,
+        best.scale,
+        float(np.sqrt(_jackknife([each.solution.scale for each in others])[0, 0])),
+    )
+
+
+class _Pair:
+    """The motions of an estimate, and those of the truth over the same times at any offset."""
+
+    def __init__(self, stamps_ns: Integers, estimate: Array, truth: Track) -> None:
+        whole = np.isfinite(estimate).all(axis=1)
+        stamps_ns, estimate = stamps_ns[whole], estimate[whole]
+        along = _SPAN.along(stamps_ns, path_length(estimate))
+        every = np.arange(len(along))
+        start = starts(_SPAN, along, np.zeros_like(every), every)
+        end = np.flatnonzero(start >= 0)
+        end = end[:: max(1, len(end) // _MOST_MOTIONS)]
+        self._stamps_ns = np.concatenate([stamps_ns[start[end]], stamps_ns[end]])
+        self._truth = truth
+        self.moved = _twists(motion(estimate[start[end]], estimate[end]))
+        usual_ns = float(np.median(np.diff(stamps_ns)))
+        of_truth_ns = float(np.median(np.diff(truth.stamps_ns)))
+        # Between its poses, an interpolated truth has less noise than at them. Offsets that are
+        # multiples of the period of a slow truth treat them all alike.
+        self.step_ns = of_truth_ns if of_truth_ns >= 0.5 * usual_ns else 0.25 * usual_ns
+        self._bound_ns = round(max(20e6, 0.6 * of_truth_ns))
+
+    def truth_at(self, offset_ns: float, every: int = 1) -> _Twists:
+        """Return the truth's motions, NaN where it is not known."""
+        first, last = np.split(self._stamps_ns, 2)
+        both = np.concatenate([first[::every], last[::every]]) + round(offset_ns)
+        poses, _ = self._truth.poses_at(both, self._bound_ns)
+        return _twists(motion(*np.split(poses, 2)))
+
+    def coarse_offset(self) -> float | None:
+        """Return the offset at which speeds and turn rates fit best; None if nothing does."""
+        every = max(1, len(self.moved.w) // _MOST_COARSE)
+        few = _Twists(self.moved.w[::every], self.moved.t[::every])
+        count = round(1e9 * MOST_OFFSET_S / self.step_ns)
+        offsets = [self.step_ns * k for k in range(-count, count + 1)]
+        costs = [_mismatch(few, self.truth_at(offset, every)) for offset in offsets]
+        if not np.isfinite(costs).any():
+            return None
+        near = offsets[int(np.argmin(costs))]
+        fine = {}
+        for offset in (near + k * self.step_ns for k in range(-2, 3)):
+            true = self.truth_at(offset)
+            known = true.known
+            if known.sum() >= LEAST_MOTIONS:
+                noise = _solve(self.moved.taken(known), true.taken(known)).noise
+                fine[offset] = float(np.log(noise).sum())
+        return min(fine, key=fine.__getitem__, default=None)
+
+
+class _Vertex(NamedTuple):
+    """Where the noise is least, in steps from the middle offset, and the solution there."""
+
+    shift: float
+    solution: _Solution
+
+
+def _vertex(moved: _Twists, trues: list[_Twists], which: Mask) -> _Vertex | None:
+    if which.sum() < LEAST_MOTIONS:
+        return None
+    solutions = [_solve(moved.taken(which), true.taken(which)) for true in trues]
+    before, middle, after = (
+        float(np.sum((each.noise / solutions[1].noise) ** 2)) for each in solutions
+    )
+    curvature = before - 2.0 * middle + after
+    shift = 0.5 * (before - after) / curvature if curvature > 0.0 else 0.0
+    return _Vertex(float(np.clip(shift, -1.0, 1.0)), solutions[1])
+
+
+def _solve(moved: _Twists, true: _Twists) -> _Solution:
+    """Return R, scale and noise on the motions that fit best, after a few steps."""
+    R, scale, noise = np.eye(3), 1.0, np.ones(2)
+    for step in range(_STEPS):
+        w, t = moved.w @ R.T, scale * moved.t @ R.T
+        off_w, off_t = true.w - w, true.t - t
+        fits = _fits(off_w) & _fits(off_t)
+        noise = np.maximum([_rms(off_w[fits]), _rms(off_t[fits])], _LEAST_NOISE)
+        if step == 0:
+            R = geometry.nearest_rotation(
+                true.w[fits].T @ moved.w[fits] / noise[0] ** 2
+                + true.t[fits].T @ moved.t[fits] / noise[1] ** 2
+            )
+        else:
+            information, pull = np.zeros((3, 3)), np.zeros(3)
+            for part, off, deviation in ((w, off_w, noise[0]), (t, off_t, noise[1])):
+                p, r = part[fits] / deviation, off[fits] / deviation
+                information += np.sum(p * p) * np.eye(3) - p.T @ p
+                pull += np.cross(p, r).sum(axis=0)
+            information += 1e-9 * np.trace(information) * np.eye(3) + 1e-300 * np.eye(3)
+            turn = geometry.quaternion_exp(np.linalg.solve(information, pull))
+            R = geometry.quaternion_to_matrix(turn) @ R
+        t = moved.t[fits] @ R.T
+        scale = float(np.sum(t * true.t[fits]) / max(np.sum(t * t), 1e-300))
+    return _Solution(R, scale, noise)
+
+
+def _fits(off: Array) -> Mask:
+    size = np.linalg.norm(off, axis=1)
+    return np.asarray(size <= np.quantile(size, _KEPT))
+
+
+def _mismatch(moved: _Twists, true: _Twists) -> float:
+    """Return how much speeds and turn rates differ, as logarithms of their trimmed squares."""
+    known = true.known
+    if known.sum() < LEAST_MOTIONS:
+        return np.inf
+    w = [np.linalg.norm(each.w[known], axis=1) for each in (moved, true)]
+    t = [np.linalg.norm(each.t[known], axis=1) for each in (moved, true)]
+    ratio = np.median(t[0]) / max(float(np.median(t[1])), 1e-12)
+    return sum(
+        float(np.log(max(_rms(np.sort(np.abs(off))[: int(_KEPT * len(off))]), _LEAST_NOISE)))
+        for off in (w[0] - w[1], t[0] - ratio * t[1])
+    )
+
+
+def _jackknife(values: ArrayLike) -> Array:
+    """Estimates without each block (blocks,) or (blocks, k) -> their covariance (k, k)."""
+    each = np.asarray(values, np.float64).reshape(_BLOCKS, -1)
+    off = each - each.mean(axis=0)
+    return np.asarray((_BLOCKS - 1) / _BLOCKS * (off.T @ off))
+
+
+def _twists(motions: Array) -> _Twists:
+    return _Twists(geometry.quaternion_log(motions[:, 3:]), motions[:, :3])
+
+
+def _logarithms(R: Array) -> Array:
+    return geometry.quaternion_log(geometry.matrix_to_quaternion(R))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values * values))) if values.size else 0.0

@@ -1,0 +1,239 @@
+"""How often intervals of ``motion.json`` hold the truth of other recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from cvo_edge.errors import UsageError
+from cvo_edge.motion.conformalize import trace_of
+from cvo_edge.motion.covariance import CHI_SQUARE, SPANS_S, nees, sums_of
+from cvo_edge.motion.drift import Running
+from cvo_edge.motion.intervals import (
+    Intervals,
+    Level,
+    MotionCalibration,
+    MotionHorizon,
+    MotionWindow,
+)
+from cvo_edge.motion.pairs import Pair
+from cvo_edge.motion.relative import motion, norms, residual
+from cvo_edge.motion.trace import Rows
+from cvo_edge.motion.windows import window_errors
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_MOST_ANCHORS = 300
+
+
+class HorizonAudit(Struct, frozen=True):
+    """Coverage of one recording at one horizon.
+
+    Attributes
+    ----------
+    dof, joint, position, rotation
+        Coverage of each degree of freedom, of all six at once, and of the two balls.
+    half_widths, radii
+        Mean half-widths and radii, m and rad.
+    nees, nees_inside
+        Mean NEES of the covariance ``interval`` over six, and the share up to the chi-square
+        quantile at 0.9, whatever the confidence.
+    """
+
+    horizon: str
+    motions: int
+    dof: tuple[float, ...]
+    joint: float
+    position: float
+    rotation: float
+    half_widths: tuple[float, ...]
+    radii: tuple[float, float]
+    nees: float
+    nees_inside: float
+
+
+class NeesAudit(Struct, frozen=True):
+    """The covariance ``integrated`` summed over a time: mean NEES over six, and share inside."""
+
+    seconds: float
+    sums: int
+    nees: float
+    nees_inside: float
+
+
+class WindowAudit(Struct, frozen=True):
+    """Share of one recording's windows whose tube holds the truth throughout."""
+
+    window: str
+    windows: int
+    position: float
+    rotation: float
+
+
+class RecordingAudit(Struct, frozen=True):
+    """One recording.
+
+    ``withheld``: share of poses without intervals because the motion is unlike any calibrated one;
+    figures of horizons leave them out.
+    """
+
+    name: str
+    group: str
+    withheld: float
+    horizons: tuple[HorizonAudit, ...]
+    windows: tuple[WindowAudit, ...]
+    integrated: tuple[NeesAudit, ...]
+
+
+class Audit(Struct, frozen=True):
+    """All recordings, with what was claimed.
+
+    ``calibrated_on``: names of recordings that seem to be in the calibration, which test nothing.
+    """
+
+    calibration: str
+    digest: str
+    confidence: float
+    rule: str
+    scope: str
+    statement: str
+    recordings: tuple[RecordingAudit, ...]
+    calibrated_on: tuple[str, ...]
+
+    def coverage(self, horizon: str) -> float | None:
+        """Return the coverage at a horizon, averaged over recordings; None without motions.
+
+        That of the degrees of freedom in the marginal scope, that of all six in the joint one.
+        """
+        found = [
+            each.joint if self.scope == "joint" else float(np.mean(each.dof))
+            for recording in self.recordings
+            for each in recording.horizons
+            if each.horizon == horizon and each.motions
+        ]
+        return float(np.mean(found)) if found else None
+
+
+def audit(calibration: MotionCalibration, level: Level, pairs: Sequence[Pair]) -> Audit:
+    """Compare the intervals of recordings with their truth.
+
+    Raises UsageError if a column of the scale is missing.
+    """
+    recordings, known = [], []
+    for pair in pairs:
+        missing = [name for name in calibration.file.columns if name not in pair.columns]
+        if missing:
+            raise UsageError(f"{pair.name}: expected the column {missing[0]}, found none")
+        rows = trace_of(scaled(calibration, pair), calibration.limits, calibration.file.columns)
+        if _known(calibration, pair, rows):
+            known.append(pair.name)
+        truth = pair.truth
+        differs = not calibration.same_rate(1e-9 * float(np.median(np.diff(pair.stamps_ns))))
+        given = _given(calibration, rows)
+        horizons = [
+            _horizon(each, each.intervals(rows, level, given), truth)
+            for each in calibration.horizons
+            if not (differs and each.horizon.unit == "f")
+        ]
+        windows = [_window(each, rows, truth, level) for each in calibration.windows]
+        recordings.append(
+            RecordingAudit(
+                pair.name,
+                pair.group,
+                1.0 - len(given) / len(rows.part),
+                tuple(horizons),
+                tuple(windows),
+                tuple(_integrated(calibration, rows, truth)),
+            )
+        )
+    file = calibration.file
+    return Audit(
+        file.name,
+        file.digest,
+        level.confidence,
+        level.rule,
+        level.scope,
+        calibration.statement(level),
+        tuple(recordings),
+        tuple(known),
+    )
+
+
+def scaled(calibration: MotionCalibration, pair: Pair) -> Pair:
+    """Return a pair with the calibration's correction of the scale."""
+    return replace(pair, estimate=calibration.scaled(pair.estimate))
+
+
+def _given(calibration: MotionCalibration, rows: Rows) -> Integers:
+    """Return the rows whose motion is like that of calibrated drives."""
+    ends = np.arange(len(rows.part))
+    novelty = calibration.familiar.novelty(rows, ends)
+    running = Running(calibration.limits.period_s).all(novelty, rows.part)
+    limit = calibration.familiar.limit
+    return ends[[value is None or value <= limit for value in running]]
+
+
+def _known(calibration: MotionCalibration, pair: Pair, rows: Rows) -> bool:
+    """Whether a recording is, by its time and path, one of those that were calibrated on."""
+    seconds, metres = 1e-9 * float(rows.stamps_ns[-1] - rows.stamps_ns[0]), float(rows.path_m[-1])
+    return any(
+        each.name.rpartition("/")[2] == pair.name.rpartition("/")[2]
+        and abs(each.seconds - seconds) <= 1e-3 * seconds
+        and abs(each.metres - metres) <= 1e-3 * metres
+        for each in calibration.file.recordings
+    )
+
+
+def _window(window: MotionWindow, rows: Rows, truth: Array, level: Level) -> WindowAudit:
+    errors = window_errors(rows, truth, window.window)
+    if not len(errors.anchor):
+        return WindowAudit(window.spec.window, 0, 0.0, 0.0)
+    inside = window.scored(errors, level)
+    position, rotation = inside.mean(axis=0).tolist()
+    return WindowAudit(window.spec.window, len(inside), position, rotation)
+
+
+def _integrated(calibration: MotionCalibration, rows: Rows, truth: Array) -> Iterator[NeesAudit]:
+    factors = calibration.file.integrated
+    if factors is None:
+        return
+    steps = next(each for each in calibration.horizons if each.spec.horizon == "1f")
+    scales = steps.step_scales(rows)
+    apart = max(1, len(rows.part) // _MOST_ANCHORS)
+    for span_s, sums in zip(SPANS_S, sums_of(rows, truth, scales, SPANS_S, apart), strict=True):
+        if len(sums.residuals):
+            found = nees(sums.residuals, sums.covariance(np.array(factors)))
+            yield NeesAudit(span_s, len(found), *_nees(found))
+
+
+def _nees(values: Array) -> tuple[float, float]:
+    return float(values.mean()) / 6.0, float((values <= CHI_SQUARE).mean())
+
+
+def _horizon(horizon: MotionHorizon, found: Intervals, truth: Array) -> HorizonAudit:
+    name = horizon.spec.horizon
+    off = residual(found.moved, motion(truth[found.start], truth[found.end]))
+    known = np.isfinite(off).all(axis=1)
+    if not known.any():
+        return HorizonAudit(name, 0, (0.0,) * 6, 0.0, 0.0, 0.0, (0.0,) * 6, (0.0, 0.0), 0.0, 0.0)
+    off, lower, upper = off[known], found.lower[known], found.upper[known]
+    inside = (lower <= off) & (off <= upper)
+    position, rotation = (norms(off - found.bias[known]) <= found.radii[known]).mean(axis=0)
+    half = 0.5 * (upper - lower).mean(axis=0)
+    radii = found.radii[known].mean(axis=0)
+    return HorizonAudit(
+        name,
+        len(off),
+        tuple(inside.mean(axis=0).tolist()),
+        float(inside.all(axis=1).mean()),
+        float(position),
+        float(rotation),
+        tuple(half.tolist()),
+        (float(radii[0]), float(radii[1])),
+        *_nees(nees(off - found.bias[known], horizon.shape.covariance(found.scale[known]))),
+    )

@@ -1,0 +1,180 @@
+"""Two covariances of an estimator's motion, for filters that need one.
+
+Neither follows from the intervals' guarantee. A covariance fits when the normalised squared error
+
+    NEES = x^T Sigma^-1 x
+
+has a mean of six, and is at most the chi-square quantile 12.6 (0.95) or 10.6 (0.9) as often as
+these say (Bar-Shalom, Li and Kirubarajan 2001, section 5.4). One covariance cannot do both jobs:
+
+``interval``
+    of the motion over one horizon: Sigma = kappa U M U, with the scales u of the interval on the
+    diagonal of U, the correlation of scaled residuals M, and kappa such that 90 % of NEES are
+    at most 10.6. It is for gates and for single measurements.
+``integrated``
+    of one step, for a filter that adds steps up as if their errors were independent, which they
+    are not: Q = diag(f u^2), with six factors f such that sums over 1, 2, 5 and 10 s are as large
+    as errors over these times. Single steps then look too uncertain; that is the price.
+
+x = (t, Log R) is in the body frame at the end of the motion, as everywhere here. A sum of steps
+carries errors along by x' = Ad(e^-1) x for each later step e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge import geometry
+from cvo_edge.motion.relative import motion, residual
+from cvo_edge.motion.thresholds import Scores
+from cvo_edge.motion.trace import Rows
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# The chi-square quantile of six degrees of freedom at 0.9.
+LEVEL, CHI_SQUARE = 0.9, 10.6446
+# Times over which an integrated covariance is fitted, and tabled.
+SPANS_S = (1.0, 2.0, 5.0, 10.0)
+# Of all calibration recordings together; anchors of one are evenly apart.
+MOST_ANCHORS = 1200
+_ROUNDS = 25
+_STEP = 0.7
+# Squares are clipped at so many times the predicted variance: outliers decide on no variance.
+_CLIP = 16.0
+_LEAST = 1e-18
+
+
+class Shape(NamedTuple):
+    """kappa M (6, 6): the covariance of residuals that are divided by their scales."""
+
+    matrix: Array
+
+    def covariance(self, scales: Array) -> Array:
+        """Return Sigma (m, 6, 6) of motions with scales (m, 8 or 6)."""
+        u = scales[:, :6]
+        return np.asarray(u[:, :, np.newaxis] * self.matrix * u[:, np.newaxis])
+
+
+def adjoint(steps: Array) -> Array:
+    """Return Ad(e^-1) (n, 6, 6) of steps e (n, 7), for twists (t, w)."""
+    inverse = np.swapaxes(geometry.quaternion_to_matrix(steps[:, 3:]), 1, 2)
+    carried = np.zeros((len(steps), 6, 6))
+    carried[:, :3, :3] = carried[:, 3:, 3:] = inverse
+    x, y, z = steps[:, :3].T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    carried[:, :3, 3:] = -inverse @ cross
+    return carried
+
+
+def in_fixed_axes(covariance: Array, q_xyzw: Array) -> Array:
+    """Return covariances (n, 6, 6) about the axes of the frame that rotations (n, 4) lead to.
+
+    A motion dE with a residual of covariance Sigma in its end's body frame has, in the frame where
+    it starts, the covariance of ``geometry_msgs/PoseWithCovariance``: x y z, then rotations about
+    the fixed axes. With dE Exp(x) that is B Sigma B^T, B = diag(R, R), R the rotation of dE.
+    """
+    R = geometry.quaternion_to_matrix(q_xyzw)
+    B = np.zeros((len(R), 6, 6))
+    B[:, :3, :3] = B[:, 3:, 3:] = R
+    return np.asarray(B @ covariance @ np.swapaxes(B, 1, 2))
+
+
+def nees(residuals: Array, covariance: Array) -> Array:
+    """Return x^T Sigma^-1 x (n,) of residuals (n, 6)."""
+    solved = np.linalg.solve(covariance, residuals[:, :, np.newaxis])[:, :, 0]
+    return np.asarray(np.sum(residuals * solved, axis=1))
+
+
+def fit_shape(scaled: Sequence[Array], groups: Sequence[str]) -> Shape:
+    """Return the shape of residuals without bias, divided by their scales, (m, 6) each."""
+    spread = np.mean([_clipped(each).T @ _clipped(each) / len(each) for each in scaled], axis=0)
+    matrix = spread + 1e-9 * np.diag(np.diag(spread)) + _LEAST * np.eye(6)
+    whole = [nees(each, np.broadcast_to(matrix, (len(each), 6, 6))) for each in scaled]
+    q = Scores([each[:, np.newaxis] for each in whole], groups).thresholds("mean", LEVEL)
+    return Shape(matrix * float(q[0]) / CHI_SQUARE)
+
+
+def _clipped(values: Array) -> Array:
+    usual = np.sqrt(_CLIP) * np.maximum(np.median(np.abs(values), axis=0), 1e-12)
+    return np.asarray(np.clip(values, -usual, usual))
+
+
+class Sums(NamedTuple):
+    """Sums of steps after anchors, over one time.
+
+    Attributes
+    ----------
+    parts
+        Shape (m, 6, 6, 6): covariance that a unit variance of each degree of freedom of all steps,
+        in units of its scale, comes to.
+    residuals
+        Shape (m, 6).
+    """
+
+    parts: Array
+    residuals: Array
+
+    def covariance(self, factors: Array) -> Array:
+        """Return the covariance (m, 6, 6) for factors f (6,)."""
+        return np.asarray(np.einsum("mdij,d->mij", self.parts, factors))
+
+
+def sums_of(
+    rows: Rows, truth: Array, scales: Array, spans_s: Sequence[float], apart: int
+) -> list[Sums]:
+    """Return sums over several ascending times after anchors ``apart`` rows from each other.
+
+    ``scales`` (n, 6): of the step that ends at each row. Sums that cross a break are left out.
+    """
+    usual = float(np.median(np.diff(rows.stamps_ns)))
+    lengths = [max(1, round(1e9 * span / usual)) for span in spans_s]
+    anchors = np.arange(0, len(rows.part) - lengths[-1] - 1, apart)
+    carried = np.zeros((len(anchors), 6, 6, 6))
+    own = np.arange(6)
+    found = []
+    for length in range(1, lengths[-1] + 1):
+        end = anchors + length
+        step = np.nan_to_num(motion(rows.poses[end - 1], rows.poses[end]))
+        A = adjoint(step)[:, np.newaxis]
+        carried = A @ carried @ np.swapaxes(A, -1, -2)
+        carried[:, own, own, own] += scales[end] ** 2
+        if length in lengths:
+            off = residual(
+                motion(rows.poses[anchors], rows.poses[end]), motion(truth[anchors], truth[end])
+            )
+            fine = np.isfinite(off).all(axis=1) & (rows.part[anchors] == rows.part[end])
+            found.append(Sums(carried[fine], off[fine]))
+    return found
+
+
+def fit_factors(recordings: Sequence[Sequence[Sums]], groups: Sequence[str]) -> Array:
+    """Return the factors f (6,), from the sums over each time of each recording.
+
+    Each round multiplies a factor by how much larger errors are than predicted, as a geometric mean
+    over times; at the end, one number scales all, so that over drives and times, 90 % of NEES are
+    at most 10.6 on average.
+    """
+    factors = np.ones(6)
+    for _ in range(_ROUNDS):
+        growth = np.zeros(6)
+        for over in zip(*recordings, strict=True):
+            ratios = np.mean([_variance_ratio(sums, factors) for sums in over], axis=0)
+            growth += np.log(np.maximum(ratios, 1e-12)) / len(recordings[0])
+        factors = factors * np.exp(_STEP * growth)
+    scores = [
+        np.concatenate([nees(sums.residuals, sums.covariance(factors)) for sums in each])
+        for each in recordings
+    ]
+    q = Scores([each[:, np.newaxis] for each in scores], groups)
+    return factors * float(q.thresholds("mean", LEVEL)[0]) / CHI_SQUARE
+
+
+def _variance_ratio(sums: Sums, factors: Array) -> Array:
+    predicted = np.einsum("mdii,d->mi", sums.parts, factors)
+    return np.asarray(np.mean(np.minimum(sums.residuals**2 / (predicted + _LEAST), _CLIP), axis=0))

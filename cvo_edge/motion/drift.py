@@ -1,0 +1,95 @@
+"""Whether an estimator moves as in the drives that it was calibrated on: no truth is needed.
+
+Thresholds say nothing of a robot that drives faster, turns harder or shakes more than any
+calibrated one. The numbers are logarithms of speed, turn rate and their changes, averaged over the
+last second, and the means of columns of the file. In units of their spread over calibrated drives,
+
+    d_t = root mean square of those above the mean (a robot that stands still is no concern)
+    D_t = D_(t-1) + w (d_t - D_(t-1)),  w = period / 5 s
+
+D starts at d a second after each break. The limit is the largest D of any calibrated drive, so that
+a new one that is exchangeable with G of them, and no longer, ever exceeds it with probability at
+most 1 / (G + 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.motion.errors import recent_rows
+from cvo_edge.motion.trace import RECENT, Rows, recent_numbers
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_MEMORY_S = 5.0
+_LEAST = 1e-6
+# Of a second, for estimators whose stamps jitter.
+_NEARLY = 0.8
+
+
+class Familiar(NamedTuple):
+    """Mean and spread (k,) of the numbers over calibrated drives, and the limit of D."""
+
+    mean: Array
+    spread: Array
+    limit: float
+
+    def novelty(self, rows: Rows, ends: Integers) -> Array:
+        """Return d (m,) at rows; NaN within a second after a break."""
+        recent = recent_rows(rows, ends)
+        off = (recent_numbers(rows, recent, ends) - self.mean) / self.spread
+        over = np.maximum(off, 0.0)
+        novelty = np.sqrt(np.mean(over * over, axis=1))
+        return np.where(_whole_second(rows, recent, ends), novelty, np.nan)
+
+
+class Running:
+    """D over the rows of a stream."""
+
+    def __init__(self, period_s: float) -> None:
+        self._weight = min(1.0, period_s / _MEMORY_S)
+        self._part = -1
+        self._value = 0.0
+
+    def add(self, novelty: float, part: int) -> float | None:
+        """Take the next d, of a row in a part, and return D; None within a second after a break."""
+        if novelty != novelty:
+            return None
+        if part != self._part:
+            self._part, self._value = part, novelty
+        else:
+            self._value += self._weight * (novelty - self._value)
+        return self._value
+
+    def all(self, novelty: Array, part: Integers) -> list[float | None]:
+        """Do the same for several rows (m,)."""
+        return [self.add(*pair) for pair in zip(novelty.tolist(), part.tolist(), strict=True)]
+
+
+def _whole_second(rows: Rows, recent: Integers, ends: Integers) -> NDArray[np.bool_]:
+    seconds = 1e-9 * (rows.stamps_ns[ends] - rows.stamps_ns[recent])
+    return np.asarray(seconds >= _NEARLY * RECENT.value)
+
+
+def fit_familiar(traces: Sequence[Rows], period_s: float) -> Familiar:
+    """Return mean, spread and limit of calibrated drives; drives count equally."""
+    every = []
+    for rows in traces:
+        ends = np.arange(len(rows.part))
+        recent = recent_rows(rows, ends)
+        ends = ends[_whole_second(rows, recent, ends)]
+        every.append(recent_numbers(rows, recent[ends], ends))
+    mean = np.mean([each.mean(axis=0) for each in every], axis=0)
+    square = np.mean([((each - mean) ** 2).mean(axis=0) for each in every], axis=0)
+    open_ended = Familiar(mean, np.maximum(np.sqrt(square), _LEAST), np.inf)
+    largest = 0.0
+    for rows in traces:
+        novelty = open_ended.novelty(rows, np.arange(len(rows.part)))
+        running = Running(period_s).all(novelty, rows.part)
+        largest = max(largest, *(value for value in running if value is not None))
+    return open_ended._replace(limit=largest)

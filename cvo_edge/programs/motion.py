@@ -1,0 +1,342 @@
+"""The commands on trajectories of any estimator: arguments and output only."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cvo_edge.errors import GateError, UsageError
+from cvo_edge.files import refuse_overwriting, write_text, write_whole
+from cvo_edge.programs.options import INTERVALS, REPORT, JsonFileOption
+from cvo_edge.vocabulary import MotionCovariance, MotionFormat, MotionRule, Scope, TrajectoryFormat
+
+if TYPE_CHECKING:
+    from cvo_edge.motion.horizons import Horizon
+
+_INPUT = "Input"
+
+FilesArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="EST GT [EST GT ...]",
+        help="Pairs of files: an estimate, then its ground truth.",
+        readable=False,
+        show_default=False,
+    ),
+]
+PairsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--pairs",
+        help="More pairs: lines EST GT [GROUP [TIMES]], relative to this file.",
+        readable=False,
+        show_default=False,
+        rich_help_panel=_INPUT,
+    ),
+]
+TrajectoryFormatOption = Annotated[
+    TrajectoryFormat | None,
+    typer.Option(
+        "--format",
+        help="Format of all files; default: as the first line of each shows.",
+        show_default=False,
+        rich_help_panel=_INPUT,
+    ),
+]
+TimesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--times",
+        help="Seconds, one a line, for files without times (kitti).",
+        readable=False,
+        show_default=False,
+        rich_help_panel=_INPUT,
+    ),
+]
+RateOption = Annotated[
+    float | None,
+    typer.Option(
+        "--fps",
+        min=0.01,
+        max=10_000.0,
+        help="Poses per second of files without times (kitti).",
+        show_default=False,
+        rich_help_panel=_INPUT,
+    ),
+]
+CorrectOption = Annotated[
+    str | None,
+    typer.Option(
+        "--correct",
+        metavar="time,frame,scale",
+        help="Correct these of what the report finds: each truth's clock and body frame, and one "
+        "scale of all estimates.",
+        show_default=False,
+    ),
+]
+MotionArgument = Annotated[
+    Path,
+    typer.Argument(help="motion.json of conformalize.", readable=False, show_default=False),
+]
+ConfidenceOption = Annotated[
+    float, typer.Option(help="A confidence stored in the file.", rich_help_panel=INTERVALS)
+]
+RuleOption = Annotated[
+    MotionRule,
+    typer.Option(help="What the confidence is stated about.", rich_help_panel=INTERVALS),
+]
+ScopeOption = Annotated[
+    Scope,
+    typer.Option(
+        help="Whether it holds for each degree of freedom or for all six at once.",
+        rich_help_panel=INTERVALS,
+    ),
+]
+
+
+def conformalize(
+    files: FilesArgument = None,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="File to write.", readable=False),
+    ] = Path("motion.json"),
+    name: Annotated[str, typer.Option(help="Estimator and vehicle, to be told by.")] = "estimator",
+    pairs: PairsOption = None,
+    group: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Drive of each pair, in their order; by default, pairs with one truth are one.",
+            show_default=False,
+            rich_help_panel=_INPUT,
+        ),
+    ] = None,
+    format: TrajectoryFormatOption = None,
+    times: TimesOption = None,
+    fps: RateOption = None,
+    horizon: Annotated[
+        str | None,
+        typer.Option(
+            help="Frames (f), seconds (s) or metres (m) back, with commas; default: those of "
+            "1f,1s,5s,10m,100m that the drives are long enough for.",
+            show_default=False,
+        ),
+    ] = None,
+    window: Annotated[
+        str | None,
+        typer.Option(
+            help="Windows of tubes, with commas, or none; default: those of 10s,100m that the "
+            "drives are long enough for.",
+            show_default=False,
+        ),
+    ] = None,
+    scale: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|none|COLUMN,...",
+            help="auto: learn where the estimator errs more, if that pays; columns of the files "
+            "may help; none: do not.",
+        ),
+    ] = "auto",
+    correct: CorrectOption = None,
+) -> None:
+    """Learn intervals on an estimator's motion from trajectories with ground truth."""
+    from cvo_edge.motion.conformalize import conformalize as learn
+    from cvo_edge.motion.format import encode_motion_file
+    from cvo_edge.programs.motion_report import calibration_lines, fit_lines
+    from cvo_edge.programs.trajectories import (
+        Reading,
+        correct_pairs,
+        fits,
+        listed_files,
+        read_pairs,
+        wanted_corrections,
+    )
+
+    wanted = wanted_corrections(correct)
+    horizons = _horizons("--horizon", horizon)
+    windows = [] if window == "none" else _horizons("--window", window)
+    given = listed_files(files or [], pairs, group or [])
+    read = [path for each in given for path in (each.estimate, each.truth, each.times) if path]
+    refuse_overwriting(str(output), *read, pairs, times)
+    found = read_pairs(given, Reading(format, times, fps))
+    fitted = fits(found)
+    print(*fit_lines(found, fitted, wanted), sep="\n")
+    corrected, correction = correct_pairs(found, fitted, wanted)
+    file = learn(
+        corrected,
+        name,
+        horizons,
+        windows,
+        learned=scale != "none",
+        columns=[] if scale in ("auto", "none") else scale.split(","),
+        correction=correction,
+    )
+    content = encode_motion_file(file)
+    write_whole(output, content)
+    print(*calibration_lines(file), sep="\n")
+    print(f"-> {output}, {len(content)} bytes")
+
+
+def _horizons(option: str, text: str | None) -> list[Horizon] | None:
+    from cvo_edge.motion.horizons import Horizon
+
+    if text is None:
+        return None
+    found = [Horizon.parse(each) for each in text.split(",")]
+    if len(set(found)) < len(found):
+        raise UsageError(f"{option}: expected each once, found {text}")
+    return found
+
+
+def annotate(
+    estimate: Annotated[
+        str,
+        typer.Argument(
+            metavar="EST",
+            help="Trajectory of the estimator; - reads lines of tum from standard input.",
+            show_default=False,
+        ),
+    ],
+    motion: MotionArgument,
+    output: Annotated[
+        str, typer.Option("-o", "--output", help="File, or - for stdout.", rich_help_panel=REPORT)
+    ] = "-",
+    confidence: ConfidenceOption = 0.9,
+    rule: RuleOption = "mean",
+    scope: ScopeOption = "marginal",
+    format: Annotated[
+        MotionFormat | None,
+        typer.Option(
+            help="Format of the records; default: by the file's suffix (.jsonl, .csv, .tum), else "
+            "jsonl. csv has a row for each horizon; tum has the poses alone.",
+            show_default=False,
+            rich_help_panel=REPORT,
+        ),
+    ] = None,
+    times: TimesOption = None,
+    fps: RateOption = None,
+    anchors: Annotated[
+        Path | None,
+        typer.Option(
+            help="Times of poses that are taken as known, seconds, one a line; tubes start there. "
+            "The first pose is one in any case.",
+            readable=False,
+            show_default=False,
+            rich_help_panel=_INPUT,
+        ),
+    ] = None,
+    covariance: Annotated[
+        MotionCovariance | None,
+        typer.Option(
+            help="Add a covariance: interval, of each motion, for gates; integrated, of each step, "
+            "for a filter that adds steps up.",
+            show_default=False,
+            rich_help_panel=INTERVALS,
+        ),
+    ] = None,
+) -> None:
+    """Put intervals on every motion of a trajectory, one JSON record per pose."""
+    from cvo_edge.motion.intervals import MotionCalibration
+    from cvo_edge.programs.annotate import annotate_file, annotate_stream, format_of
+    from cvo_edge.programs.trajectories import Reading
+
+    calibration = MotionCalibration.load(motion)
+    level = calibration.level(confidence, rule, scope)
+    written_as = format_of(output, format)
+    if estimate == "-":
+        if anchors is not None:
+            raise UsageError("--anchors: expected a file of poses, found standard input")
+        refuse_overwriting(output, motion)
+        annotate_stream(calibration, level, output, written_as, covariance)
+        return
+    refuse_overwriting(output, estimate, motion, times, anchors)
+    poses = Reading(None, times, fps).poses(Path(estimate))
+    annotate_file(calibration, level, poses, output, written_as, anchors, covariance)
+
+
+def audit(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="EST GT [EST GT ...] MOTION",
+            help="Pairs of files, then motion.json of conformalize.",
+            readable=False,
+            show_default=False,
+        ),
+    ],
+    pairs: PairsOption = None,
+    confidence: ConfidenceOption = 0.9,
+    rule: RuleOption = "mean",
+    scope: ScopeOption = "marginal",
+    format: TrajectoryFormatOption = None,
+    times: TimesOption = None,
+    fps: RateOption = None,
+    correct: CorrectOption = None,
+    json_file: JsonFileOption = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            help="PNG file: the first recording from above with its tubes, errors and radii by "
+            "horizon, coverage by recording (extra [plot]).",
+            readable=False,
+            show_default=False,
+            rich_help_panel=REPORT,
+        ),
+    ] = None,
+    min_coverage: Annotated[
+        float | None,
+        typer.Option(help="Exit 8 if the coverage of a horizon is lower.", rich_help_panel="Gates"),
+    ] = None,
+) -> None:
+    """Check intervals on recordings with ground truth that they were not learnt from."""
+    import msgspec
+
+    from cvo_edge.motion.audit import audit as compare
+    from cvo_edge.motion.intervals import MotionCalibration
+    from cvo_edge.programs.motion_report import audit_lines
+    from cvo_edge.programs.trajectories import (
+        Reading,
+        correct_pairs,
+        fits,
+        listed_files,
+        read_pairs,
+        wanted_corrections,
+    )
+
+    if min_coverage is not None and not 0.0 <= min_coverage <= 1.0:
+        raise UsageError(f"--min-coverage: expected 0 to 1, found {min_coverage:g}")
+    *given, motion = files
+    wanted = wanted_corrections(correct)
+    if "scale" in wanted:
+        raise UsageError("--correct: expected time or frame, found scale, which motion.json holds")
+    calibration = MotionCalibration.load(motion)
+    level = calibration.level(confidence, rule, scope)
+    named = listed_files(given, pairs, [])
+    read = [path for each in named for path in (each.estimate, each.truth, each.times) if path]
+    for written in (json_file, picture):
+        if written is not None:
+            refuse_overwriting(str(written), *read, motion, pairs, times)
+    found = read_pairs(named, Reading(format, times, fps))
+    if wanted:
+        found, _ = correct_pairs(found, fits(found), wanted)
+    report = compare(calibration, level, found)
+    if json_file is not None:
+        write_text(json_file, json.dumps(msgspec.to_builtins(report), indent=1) + "\n")
+    if picture is not None:
+        from cvo_edge.programs.motion_picture import draw_audit
+
+        draw_audit(picture, calibration, level, found, report)
+    if json_file != "-":
+        print(*audit_lines(report), sep="\n")
+    if min_coverage is None:
+        return
+    for spec in calibration.file.horizons:
+        coverage = report.coverage(spec.horizon)
+        if coverage is not None and coverage < min_coverage:
+            raise GateError(
+                f"audit: expected a coverage of at least {min_coverage:g} at every horizon, found "
+                f"{coverage:.3f} at {spec.horizon}"
+            )

@@ -1,0 +1,197 @@
+"""The texts of the commands on trajectories."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from cvo_edge.errors import printable
+from cvo_edge.motion.audit import Audit
+from cvo_edge.motion.corrections import Fit
+from cvo_edge.motion.format import MotionFile
+from cvo_edge.motion.intervals import Level, MotionCalibration
+from cvo_edge.motion.pairs import Pair
+from cvo_edge.vocabulary import MOTION_RULES, MotionCorrection
+
+_AXES = "xyz"
+
+
+def fit_lines(pairs: Sequence[Pair], fits: Sequence[Fit], made: Sequence[str]) -> Iterator[str]:
+    """Yield the alignment report: one line a pair, then what is worth correcting."""
+    width = max(len("recording"), *(len(fit.name) for fit in fits))
+    yield (
+        f"{'recording':<{width}}  {'truth - estimate':>16}  {'body frame, deg (x y z)':>26}  "
+        f"{'scale':>14}  undetermined"
+    )
+    for fit in fits:
+        found = fit.alignment
+        turn = " ".join(f"{value:.2f}" for value in np.rad2deg(found.determined_rotation))
+        lost = ", ".join("about " + _axis(axis) for axis in found.undetermined) or "-"
+        yield (
+            f"{printable(fit.name):<{width}}  "
+            f"{1e3 * found.offset_s:7.1f} +-{1e3 * found.offset_error_s:4.1f} ms  "
+            f"{turn:>26}  {found.scale:.4f}+-{found.scale_error:.4f}  {lost}"
+        )
+    for correction in ("time", "frame", "scale"):
+        yield from _worth(pairs, fits, correction, correction in made)
+
+
+def _axis(axis: np.ndarray) -> str:
+    """Return an axis by its name if it is nearly one of the body's, else its numbers."""
+    largest = int(np.argmax(np.abs(axis)))
+    if abs(axis[largest]) > math.cos(math.radians(15.0)):
+        return _AXES[largest]
+    return "(" + " ".join(f"{value:.2f}" for value in axis) + ")"
+
+
+def _worth(
+    pairs: Sequence[Pair], fits: Sequence[Fit], correction: MotionCorrection, made: bool
+) -> Iterator[str]:
+    found = [
+        (pair, fit) for pair, fit in zip(pairs, fits, strict=True) if fit.effects[correction].worth
+    ]
+    if not found:
+        return
+    before = np.median([fit.effects[correction].before for _, fit in found], axis=0)
+    after = np.median([fit.effects[correction].after for _, fit in found], axis=0)
+    changes = "; ".join(
+        f"over {name} {100 * b[0]:.3g} -> {100 * a[0]:.3g} cm, "
+        f"{math.degrees(b[1]):.3g} -> {math.degrees(a[1]):.3g} deg"
+        for name, b, a in zip(("one frame", "1 s"), before, after, strict=True)
+    )
+    what = _what(found, correction)
+    yield (
+        f"{correction}: {what} in {len(found)} of {len(fits)}: correcting it takes the error that "
+        f"90 % of motions do not exceed (median) {changes}"
+    )
+    yield (
+        "  corrected, as asked" if made else f"  not corrected; --correct {correction} does that"
+    )
+
+
+def _what(found: Sequence[tuple[Pair, Fit]], correction: MotionCorrection) -> str:
+    if correction == "time":
+        offsets = [fit.alignment.offset_s for _, fit in found]
+        period_s = float(
+            np.median([1e-9 * np.median(np.diff(pair.stamps_ns)) for pair, _ in found])
+        )
+        middle = float(np.median(offsets))
+        return f"stamps differ by {middle:.3f} s ({abs(middle) / period_s:.1f} frames)"
+    if correction == "frame":
+        turns = [np.linalg.norm(fit.alignment.determined_rotation) for _, fit in found]
+        return f"body frames differ by {math.degrees(float(np.median(turns))):.2f} deg"
+    scales = [fit.alignment.scale for _, fit in found]
+    return f"the scale differs ({min(scales):.3f} .. {max(scales):.3f})"
+
+
+def calibration_lines(file: MotionFile) -> Iterator[str]:
+    """Yield what was calibrated: for each horizon half-widths at 0.9, and what each rule states."""
+    calibration = MotionCalibration(file)
+    yield (
+        f"{'horizon':>8}{'drives':>8}{'motions':>9}{'bias':>6}{'scale':>7}  "
+        "usual radius at 0.9: cm, deg by rule"
+    )
+    for spec, horizon in zip(file.horizons, calibration.horizons, strict=True):
+        parts = []
+        for rule in MOTION_RULES:
+            radii = horizon.thresholds(Level(rule=rule))[6:] * spec.usual[6:]
+            parts.append(f"{rule} {_radii(*radii)}")
+        yield (
+            f"{spec.horizon:>8}{spec.recordings:>8}{spec.motions:>9}"
+            f"{'yes' if spec.bias else 'no':>6}{'yes' if spec.scale else 'no':>7}  "
+            + "; ".join(parts)
+        )
+    for window in calibration.windows:
+        ends = [window.end_radii(Level(rule=rule)) for rule in MOTION_RULES]
+        parts = [f"{rule} {_radii(*end)}" for rule, end in zip(MOTION_RULES, ends, strict=True)]
+        yield (
+            f"tube of {window.spec.window}: {window.spec.recordings} drives, "
+            f"{window.spec.anchors} anchors; radius at its end: " + "; ".join(parts)
+        )
+    for rule in MOTION_RULES:
+        yield f"{rule}: {calibration.statement(Level(rule=rule))}"
+
+
+def _radii(position: float, rotation: float) -> str:
+    """Return radii in cm and degrees."""
+    if not math.isfinite(position):
+        return "unbounded"
+    return f"{100.0 * position:.3g} {math.degrees(rotation):.2g}"
+
+
+def audit_lines(report: Audit) -> Iterator[str]:
+    """Yield an audit: coverage and width by horizon, over recordings."""
+    yield f"{report.calibration}: {report.confidence:g} {report.rule}, {report.scope}"
+    yield report.statement
+    if report.calibrated_on:
+        names = ", ".join(map(printable, report.calibrated_on))
+        yield f"warning: {names} seem to be calibrated on, which tests nothing"
+    withheld = {each.name: each.withheld for each in report.recordings if each.withheld}
+    if withheld:
+        names = ", ".join(f"{printable(name)} {share:.2f}" for name, share in withheld.items())
+        yield f"share of poses without intervals, as faster or rougher than calibrated: {names}"
+    yield (
+        f"{'horizon':>8}{'recordings':>12}{'each DoF':>10}{'all six':>9}{'position':>10}"
+        f"{'rotation':>10}{'least':>7}  mean half-width, radius"
+    )
+    for name in dict.fromkeys(each.horizon for r in report.recordings for each in r.horizons):
+        found = [
+            each
+            for recording in report.recordings
+            for each in recording.horizons
+            if each.horizon == name and each.motions
+        ]
+        if not found:
+            yield f"{name:>8}{0:>12}  no recording is long enough"
+            continue
+        dof = np.array([each.dof for each in found])
+        half = np.mean([each.half_widths for each in found], axis=0)
+        radii = np.mean([each.radii for each in found], axis=0)
+        yield (
+            f"{name:>8}{len(found):>12}{dof.mean():>10.3f}"
+            f"{np.mean([each.joint for each in found]):>9.3f}"
+            f"{np.mean([each.position for each in found]):>10.3f}"
+            f"{np.mean([each.rotation for each in found]):>10.3f}"
+            f"{dof.mean(axis=1).min():>7.2f}  "
+            f"{100 * half[:3].mean():.3g} cm {math.degrees(half[3:].mean()):.3g} deg, "
+            f"{100 * radii[0]:.3g} cm {math.degrees(radii[1]):.3g} deg"
+        )
+    for name in dict.fromkeys(each.window for r in report.recordings for each in r.windows):
+        windows = [
+            each
+            for recording in report.recordings
+            for each in recording.windows
+            if each.window == name and each.windows
+        ]
+        if windows:
+            yield (
+                f"tube of {name}: whole windows inside, over {len(windows)} recordings: position "
+                f"{np.mean([each.position for each in windows]):.3f}, rotation "
+                f"{np.mean([each.rotation for each in windows]):.3f}"
+            )
+    yield "NEES over 6 (1 fits), and share up to chi-square's 0.9 quantile; means over recordings"
+    for name in dict.fromkeys(each.horizon for r in report.recordings for each in r.horizons):
+        found = [
+            each
+            for recording in report.recordings
+            for each in recording.horizons
+            if each.horizon == name and each.motions
+        ]
+        if found:
+            yield (
+                f"{name:>8}  interval    {np.mean([each.nees for each in found]):6.2f}"
+                f"{np.mean([each.nees_inside for each in found]):8.3f}"
+            )
+    for span_s in dict.fromkeys(each.seconds for r in report.recordings for each in r.integrated):
+        sums = [
+            each
+            for recording in report.recordings
+            for each in recording.integrated
+            if each.seconds == span_s
+        ]
+        yield (
+            f"{span_s:>7g}s  integrated  {np.mean([each.nees for each in sums]):6.2f}"
+            f"{np.mean([each.nees_inside for each in sums]):8.3f}"
+        )

@@ -1,0 +1,179 @@
+"""What the commands on trajectories share: which files belong together, and their reading."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from itertools import takewhile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from cvo_edge import geometry
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.motion.alignment import LEAST_MOTIONS
+from cvo_edge.motion.corrections import Fit, corrected, fit_of
+from cvo_edge.motion.files import Poses, read_poses
+from cvo_edge.motion.format import CorrectionSpec
+from cvo_edge.motion.pairs import Pair, pair_of
+from cvo_edge.trajectories.tables import read_text
+from cvo_edge.vocabulary import MOTION_CORRECTIONS, MotionCorrection, TrajectoryFormat
+
+# Scales of recordings of one estimator may differ by this factor.
+_MOST_SPREAD = 1.1
+_FORM = "estimate truth [group [times]]"
+
+
+class Files(NamedTuple):
+    """An estimate, its truth, the drive that they are of, and a file of times."""
+
+    estimate: Path
+    truth: Path
+    group: str | None = None
+    times: Path | None = None
+
+
+class Reading(NamedTuple):
+    """How files are read: their format, and times for formats without."""
+
+    format: TrajectoryFormat | None = None
+    times: Path | None = None
+    fps: float | None = None
+
+    def poses(self, path: Path, times: Path | None = None) -> Poses:
+        """Read a file; raises SourceError and UsageError."""
+        return read_poses(path, self.format).stamped(times or self.times, self.fps)
+
+
+def listed_files(given: Sequence[Path], pairs: Path | None, groups: Sequence[str]) -> list[Files]:
+    """Return the pairs of a command line: EST GT [EST GT ...] or a list, and their groups.
+
+    Raises UsageError for an odd number of files or of groups, SourceError for a malformed list.
+    """
+    if len(given) % 2:
+        raise UsageError(f"files: expected pairs EST GT, found {len(given)} files")
+    files = [Files(est, gt) for est, gt in zip(given[::2], given[1::2], strict=True)]
+    if pairs is not None:
+        files += _listed(pairs)
+    if not files:
+        raise UsageError("files: expected EST GT [EST GT ...] or --pairs FILE, found none")
+    if groups:
+        if len(groups) != len(files):
+            raise UsageError(
+                f"--group: expected one for each of {len(files)} pairs, found {len(groups)}"
+            )
+        files = [each._replace(group=group) for each, group in zip(files, groups, strict=True)]
+    return files
+
+
+def _listed(path: Path) -> list[Files]:
+    """Read lines ``estimate truth [group [times]]``; paths are relative to the list's folder."""
+    files = []
+    for number, line in enumerate(read_text(path, _FORM).splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        if not 2 <= len(words) <= 4:
+            raise SourceError(f"{path}: expected {_FORM}, found {line[:80]!r} in line {number}")
+        group = words[2] if len(words) > 2 else None
+        times = path.parent / words[3] if len(words) > 3 else None
+        files.append(Files(path.parent / words[0], path.parent / words[1], group, times))
+    return files
+
+
+def read_pairs(files: Sequence[Files], reading: Reading) -> list[Pair]:
+    """Read pairs. Estimates of one truth are one group, unless another is given.
+
+    Raises SourceError and UsageError.
+    """
+    truths: dict[tuple[Path, Path | None], Poses] = {}
+    names = _names([each.estimate for each in files])
+    drives = _names([each.truth for each in files])
+    pairs = []
+    for each, name, drive in zip(files, names, drives, strict=True):
+        key = (each.truth, each.times)
+        if key not in truths:
+            truths[key] = reading.poses(each.truth, each.times)
+        estimate = reading.poses(each.estimate, each.times)
+        pairs.append(pair_of(name, each.group or drive, estimate, truths[key]))
+    return pairs
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Return the paths without suffixes, and without the folders and names that all share."""
+    parts = [path.absolute().with_suffix("").parts for path in paths]
+    rest = [part[min(_alike(parts), len(part) - 1) :] for part in parts]
+    ends = _alike([part[::-1] for part in rest])
+    return ["/".join(part[: max(1, len(part) - ends)]) for part in rest]
+
+
+def _alike(parts: Sequence[Sequence[str]]) -> int:
+    """Return how many parts all begin with."""
+    return len(list(takewhile(lambda column: len(set(column)) == 1, zip(*parts, strict=False))))
+
+
+def fits(pairs: Sequence[Pair]) -> list[Fit]:
+    """Compare the trajectories of each pair.
+
+    Raises SourceError for a pair with too few motions, and for one in other units.
+    """
+    found = []
+    for pair in pairs:
+        alignment = pair.aligned()
+        if alignment is None:
+            raise SourceError(
+                f"{pair.name}: expected at least {LEAST_MOTIONS} motions with a truth, found "
+                "fewer, or none that moves"
+            )
+        fit = fit_of(pair, alignment)
+        if fit.unit is not None:
+            raise SourceError(
+                f"{pair.name}: expected metres in both files, found motions of the truth that are "
+                f"{alignment.scale:.4g} times the estimate's; convert one of them"
+            )
+        found.append(fit)
+    return found
+
+
+def wanted_corrections(text: str | None) -> tuple[MotionCorrection, ...]:
+    """Return the corrections of a list ``time,frame,scale``; raises UsageError for others."""
+    words = [word for word in re.split(r"[,\s]+", text or "") if word]
+    known = {str(each): each for each in MOTION_CORRECTIONS}
+    for word in words:
+        if word not in known:
+            raise UsageError(
+                f"--correct: expected any of {','.join(MOTION_CORRECTIONS)}, found {word}"
+            )
+    return tuple(each for each in MOTION_CORRECTIONS if each in words)
+
+
+def correct_pairs(
+    pairs: Sequence[Pair], fits: Sequence[Fit], wanted: Sequence[MotionCorrection]
+) -> tuple[list[Pair], CorrectionSpec]:
+    """Return pairs with their own time and frame corrected, and with one scale for all.
+
+    Raises UsageError for scales that differ by more than a tenth: no number corrects them.
+    """
+    alignments = [fit.alignment for fit in fits]
+    scale = None
+    if "scale" in wanted:
+        scales = [each.scale for each in alignments]
+        if max(scales) > _MOST_SPREAD * min(scales):
+            raise UsageError(
+                f"--correct scale: expected one scale of all recordings, found {min(scales):.3f} "
+                f".. {max(scales):.3f}; leave it out, or scale each file"
+            )
+        scale = float(f"{np.median(scales):.6g}")
+    own = [
+        corrected(pair, alignment, [each for each in wanted if each != "scale"], scale)
+        for pair, alignment in zip(pairs, alignments, strict=True)
+    ]
+    turns = np.array([geometry.quaternion_exp(each.determined_rotation) for each in alignments])
+    turn = geometry.mean_rotation(turns).tolist() if "frame" in wanted else None
+    offset_s = float(np.median([each.offset_s for each in alignments]))
+    return own, CorrectionSpec(
+        offset_s=round(offset_s, 6) if "time" in wanted else None,
+        q_xyzw=tuple(turn) if turn else None,
+        scale=scale,
+    )

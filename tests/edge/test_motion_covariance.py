@@ -1,0 +1,85 @@
+"""Covariances of motions: their axes, sums of steps, and how they fit errors."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from cvo_edge import geometry
+from cvo_edge.motion.audit import audit
+from cvo_edge.motion.conformalize import conformalize
+from cvo_edge.motion.covariance import (
+    CHI_SQUARE,
+    LEVEL,
+    Shape,
+    adjoint,
+    fit_shape,
+    in_fixed_axes,
+    nees,
+)
+from cvo_edge.motion.horizons import Horizon
+from cvo_edge.motion.intervals import MotionCalibration
+from cvo_edge.motion.relative import residual
+
+from .simulated_drives import composed, drive, twist
+
+Array = NDArray[np.float64]
+
+
+def any_covariance(generator: np.random.Generator, size: float) -> Array:
+    root = size * generator.normal(size=(6, 6))
+    return root @ root.T
+
+
+def test_fixed_axes_are_those_of_samples() -> None:
+    """100,000 true motions around an estimated one, seen from the frame where it starts."""
+    generator = np.random.default_rng(0)
+    moved = twist(np.array([1.0, -2.0, 0.5, 0.8, -0.3, 1.2]))
+    covariance = any_covariance(generator, 0.002)
+    x = generator.multivariate_normal(np.zeros(6), covariance, 100_000)
+    true = composed(np.tile(moved, (len(x), 1)), twist(x))
+    turned = geometry.quaternion_multiply(true[:, 3:], geometry.quaternion_conjugate(moved[3:]))
+    off = np.concatenate([true[:, :3] - moved[:3], geometry.quaternion_log(turned)], axis=1)
+    found = in_fixed_axes(covariance[np.newaxis], moved[np.newaxis, 3:])[0]
+    np.testing.assert_allclose(np.cov(off.T), found, atol=0.03 * np.abs(found).max())
+
+
+def test_a_step_carries_small_errors_along() -> None:
+    generator = np.random.default_rng(1)
+    before, step = twist(generator.normal(size=6)), twist(generator.normal(size=6))
+    for x in 1e-5 * generator.normal(size=(5, 6)):
+        # The estimate before * step, the truth before * Exp(x) * step.
+        off = residual(composed(before, step), composed(composed(before, twist(x)), step))
+        carried = adjoint(step[np.newaxis])[0] @ x
+        np.testing.assert_allclose(off, carried, atol=1e-8)
+
+
+def test_a_shape_fits_normal_residuals() -> None:
+    generator = np.random.default_rng(2)
+    covariance = any_covariance(generator, 1.0)
+    samples = [generator.multivariate_normal(np.zeros(6), covariance, 4000) for _ in range(4)]
+    shape = fit_shape(samples, "abcd")
+    np.testing.assert_allclose(shape.matrix, covariance, atol=0.1 * np.abs(covariance).max())
+    scales = np.array([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]])
+    found = Shape(covariance).covariance(scales)[0]
+    np.testing.assert_allclose(found, np.diag(scales[0]) @ covariance @ np.diag(scales[0]))
+
+
+def test_the_quantile_is_chi_squares() -> None:
+    assert abs(CHI_SQUARE - chi2(6).ppf(LEVEL)) < 1e-4
+    generator = np.random.default_rng(3)
+    covariance = any_covariance(generator, 1.0)
+    x = generator.multivariate_normal(np.zeros(6), covariance, 2000)
+    expected = np.einsum("ni,ij,nj->n", x, np.linalg.inv(covariance), x)
+    np.testing.assert_allclose(nees(x, np.tile(covariance, (2000, 1, 1))), expected)
+
+
+def test_both_covariances_fit_drives_with_independent_steps() -> None:
+    horizons = (Horizon.parse("1f"), Horizon.parse("1s"))
+    pairs = [drive(60 + seed, 500) for seed in range(8)]
+    calibration = MotionCalibration(conformalize(pairs[:5], "test", horizons, []))
+    report = audit(calibration, calibration.level(), pairs[5:])
+    rows = [(*recording.horizons, *recording.integrated) for recording in report.recordings]
+    for over in zip(*rows, strict=True):
+        assert 0.6 < np.mean([each.nees for each in over]) < 1.5, over
+        assert np.mean([each.nees_inside for each in over]) > 0.8, over
+    assert [each.seconds for each in report.recordings[0].integrated] == [1.0, 2.0, 5.0, 10.0]

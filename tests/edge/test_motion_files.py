@@ -1,0 +1,412 @@
+"""``motion.json``, trajectories in files, and the commands on them."""
+
+import json
+from hashlib import sha256
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cvo_edge.errors import CalibrationFileError, SourceError, UsageError
+from cvo_edge.estimate import Status
+from cvo_edge.motion.audit import audit
+from cvo_edge.motion.conformalize import conformalize
+from cvo_edge.motion.files import OPENVINS_FORM, read_poses
+from cvo_edge.motion.format import MotionFile, decode_motion_file, encode_motion_file
+from cvo_edge.motion.horizons import Horizon
+from cvo_edge.motion.intervals import MotionCalibration
+from cvo_edge.motion.pairs import Pair
+from cvo_edge.motion.records import MotionHeader, MotionReason, MotionRecord
+from cvo_edge.motion.tracker import MotionTracker, annotate
+from cvo_edge.programs.cli import app
+from cvo_edge.vocabulary import MOTION_RULES
+
+from .simulated_drives import drive
+
+HORIZONS = tuple(map(Horizon.parse, ("1f", "1s", "5m")))
+WINDOWS = (Horizon.parse("5s"),)
+
+
+@pytest.fixture(scope="module")
+def file() -> MotionFile:
+    return conformalize(
+        [drive(seed, noise=1.0 + seed % 3) for seed in range(6)], "test", HORIZONS, WINDOWS
+    )
+
+
+@pytest.fixture(scope="module")
+def calibration(file: MotionFile) -> MotionCalibration:
+    return MotionCalibration(file)
+
+
+def written(pair: Pair, folder: Path) -> tuple[Path, Path]:
+    """Write a pair as two TUM files."""
+    paths = folder / f"{pair.name}.tum", folder / f"{pair.name}-truth.tum"
+    for path, poses in zip(paths, (pair.estimate, pair.track.poses), strict=True):
+        table = np.column_stack([1e-9 * pair.stamps_ns, poses])
+        np.savetxt(path, table, fmt="%.9f")
+    return paths
+
+
+def run(*words: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=True)
+    error = result.exception
+    code = getattr(error, "exit_code", result.exit_code)
+    return code, f"{result.output}{error if code else ''}"
+
+
+def test_a_file_comes_back(file: MotionFile) -> None:
+    content = encode_motion_file(file)
+    again = decode_motion_file(content)
+    assert msgspec.structs.replace(again, digest=file.digest) == file
+    assert encode_motion_file(again) == content
+
+
+def test_the_order_of_recordings_does_not_change_the_file(file: MotionFile) -> None:
+    pairs = [drive(seed, noise=1.0 + seed % 3) for seed in reversed(range(6))]
+    again = conformalize(pairs, "test", HORIZONS, WINDOWS)
+    assert encode_motion_file(again) == encode_motion_file(file)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("schema_version", 2, "schema_version: expected 1, found 2"),
+        ("kind", "bundle", "kind"),
+        ("extra", 1, "extra"),
+        ("groups", 0, "groups"),
+        ("horizons", [], "horizons: expected each once"),
+    ],
+)
+def test_a_changed_file_is_refused(file: MotionFile, key: str, value: object, message: str) -> None:
+    document = msgspec.to_builtins(file) | {key: value}
+    with pytest.raises(CalibrationFileError, match=r"motion\.json: .*"):
+        decode_motion_file(json.dumps(document).encode())
+    # The same with a digest that fits.
+    document["digest"] = "0" * 64
+    plain = json.dumps(document).encode()
+    signed = plain.replace(b"0" * 64, sha256(plain).hexdigest().encode(), 1)
+    with pytest.raises(CalibrationFileError, match=message):
+        decode_motion_file(signed)
+
+
+def test_every_changed_byte_is_noticed(file: MotionFile) -> None:
+    content = encode_motion_file(file)
+    for place in range(0, len(content), 997):
+        altered = bytearray(content)
+        altered[place] ^= 1
+        with pytest.raises(CalibrationFileError):
+            decode_motion_file(bytes(altered))
+
+
+def test_a_stream_gives_the_records_of_a_file(calibration: MotionCalibration) -> None:
+    pair = drive(1, 150)
+    poses, stamps = pair.estimate.copy(), pair.stamps_ns.copy()
+    poses[40] = np.nan
+    poses[80:, :3] += 50.0
+    stamps[110:] += 10**9
+    level = calibration.level()
+    whole = list(annotate(calibration, level, stamps, poses, {}))
+    tracker = MotionTracker(calibration)
+    for stamp, pose, expected in zip(stamps.tolist(), poses, whole, strict=True):
+        found = tracker.step(stamp, pose)
+        same(*map(msgspec.to_builtins, (found, expected)))
+    assert [(record.seq, *record.reasons) for record in whole if record.reasons] == [
+        (0, MotionReason.TRAJECTORY_STARTED),
+        (40, MotionReason.POSE_MISSING),
+        (41, MotionReason.GAP),
+        (80, MotionReason.JUMP),
+        (110, MotionReason.GAP),
+    ]
+    assert {record.status for record in whole if not record.reasons} == {Status.OK}
+    for seq in (0, 40, 41, 80, 110):
+        assert whole[seq].status != Status.OK
+        assert not any(each.bounded for each in whole[seq].motion)
+
+
+def same(found: object, expected: object) -> None:
+    """Sums of products of another length may round in another way."""
+    if isinstance(found, dict):
+        assert isinstance(expected, dict)
+        assert found.keys() == expected.keys()
+        for key, value in found.items():
+            same(value, expected[key])
+    elif isinstance(found, list | tuple) and not (found and isinstance(found[0], float)):
+        for one, other in zip(found, expected, strict=True):
+            same(one, other)
+    elif isinstance(found, float | list | tuple):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    else:
+        assert found == expected
+
+
+def test_a_stamp_that_goes_back_changes_nothing(calibration: MotionCalibration) -> None:
+    pair = drive(21, 60)
+    plain, disturbed = MotionTracker(calibration), MotionTracker(calibration)
+    for place, (stamp, pose) in enumerate(zip(pair.stamps_ns.tolist(), pair.estimate, strict=True)):
+        expected = plain.step(stamp, pose)
+        found = disturbed.step(stamp, pose)
+        assert found.motion[0].lower == expected.motion[0].lower
+        if place % 10 == 5:
+            late = disturbed.step(stamp, pair.estimate[0])
+            assert late.status == Status.INVALID
+            assert late.reasons == (MotionReason.STAMP_NOT_LATER,)
+
+
+def test_a_faster_robot_is_not_like_those_of_the_calibration(
+    calibration: MotionCalibration,
+) -> None:
+    pair = drive(1, 300)
+    faster = pair.estimate.copy()
+    faster[:, :3] *= 3.0
+    limits = calibration.limits
+    # Below the limits that would make it jump.
+    assert np.linalg.norm(np.diff(faster[:, :3], axis=0), axis=1).max() < limits.speed * 0.05
+    level = calibration.level()
+    plain, fast = (
+        list(annotate(calibration, level, pair.stamps_ns, poses, {}))
+        for poses in (pair.estimate, faster)
+    )
+    assert not any(MotionReason.MOTION_UNFAMILIAR in record.reasons for record in plain)
+    last = fast[-1]
+    assert last.novelty is not None
+    assert last.novelty > 1.0
+    assert (last.status, last.reasons) == (Status.DEGRADED, (MotionReason.MOTION_UNFAMILIAR,))
+    assert not any(each.bounded for each in (*last.motion, *last.since_anchor))
+
+
+@pytest.fixture(scope="module")
+def plain() -> MotionCalibration:
+    drives = [drive(80 + seed, 300) for seed in range(4)]
+    return MotionCalibration(conformalize(drives, "plain", HORIZONS[:2], [], learned=False))
+
+
+@pytest.mark.parametrize("delay", [0, 40, 150])
+def test_late_labels_bring_back_what_is_stated(plain: MotionCalibration, delay: int) -> None:
+    """A drive with three times the calibrated errors, whose truth comes late."""
+    pair = drive(90, 1200, noise=3.0)
+    tracker = MotionTracker(plain, adapt=True)
+    inside = []
+    for place, (stamp, pose) in enumerate(zip(pair.stamps_ns.tolist(), pair.estimate, strict=True)):
+        tracker.step(stamp, pose)
+        if (late := place - delay) >= 0:
+            update = tracker.observe(int(pair.stamps_ns[late]), pair.track.poses[late])
+            if update.covered[0] is not None:
+                inside.append(update.covered[0][:6])
+    assert np.mean(inside[:5]) < 0.7
+    assert abs(np.mean(inside[-500:]) - 0.9) < 0.05
+    assert 1.8 < np.mean(update.factor[0]) < 5.0
+
+
+def test_lone_labels_move_nothing(plain: MotionCalibration) -> None:
+    """Over one frame, a truth every fifth pose tells nothing: motions need one at both ends."""
+    pair = drive(90, 100, noise=3.0)
+    tracker = MotionTracker(plain, adapt=True)
+    for place, (stamp, pose) in enumerate(zip(pair.stamps_ns.tolist(), pair.estimate, strict=True)):
+        tracker.step(stamp, pose)
+        if place % 5 == 0:
+            update = tracker.observe(stamp, pair.track.poses[place])
+            assert update.covered[0] is None
+            # Over a second it does: twenty poses, or at least sixteen at the start.
+            assert (update.covered[1] is None) == (place < 16)
+
+
+def test_labels_need_a_tracker_that_adapts(calibration: MotionCalibration) -> None:
+    pair = drive(1, 30)
+    tracker = MotionTracker(calibration)
+    tracker.step(0, pair.estimate[0])
+    with pytest.raises(UsageError, match="adapt=True"):
+        tracker.observe(0, pair.estimate[0])
+    adapting = MotionTracker(calibration, adapt=True)
+    adapting.step(0, pair.estimate[0])
+    with pytest.raises(UsageError, match=r"^stamp: expected that of a pose"):
+        adapting.observe(1, pair.estimate[0])
+
+
+def test_a_tube_starts_at_its_anchor(calibration: MotionCalibration) -> None:
+    pair = drive(24, 300)
+    level = calibration.level()
+    anchor_ns = int(pair.stamps_ns[150])
+    records = list(annotate(calibration, level, pair.stamps_ns, pair.estimate, {}, [anchor_ns]))
+    tracker = MotionTracker(calibration)
+    for place, record in enumerate(records):
+        if place == 151:
+            tracker.anchor(anchor_ns)
+        found = tracker.step(int(pair.stamps_ns[place]), pair.estimate[place])
+        if place != 150:  # in the stream, this pose became the anchor later
+            same(*map(msgspec.to_builtins, (found, record)))
+    tube = [record.since_anchor[0] for record in records]
+    assert [each.anchor_seq for each in tube] == [0] * 150 + [150] * 151
+    # Five seconds are a hundred steps; then the tube ends until the next anchor.
+    assert [each.bounded for each in tube] == [True] * 101 + [False] * 49 + [True] * 101 + [
+        False
+    ] * 50
+    radii = [each.position for each in tube[:101]]
+    assert radii == sorted(radii)
+    with pytest.raises(UsageError, match=r"^stamp: expected"):
+        tracker.anchor(anchor_ns + 1)
+
+
+def test_another_rate_ends_horizons_in_frames(calibration: MotionCalibration) -> None:
+    pair = drive(22, 200)
+    half = slice(None, None, 2)
+    level = calibration.level()
+    *_, record = annotate(calibration, level, pair.stamps_ns[half], pair.estimate[half], {})
+    assert record.reasons == (MotionReason.RATE_DIFFERS,)
+    assert [each.bounded for each in record.motion] == [False, True, True]
+
+
+def test_wrong_poses_are_refused(calibration: MotionCalibration) -> None:
+    tracker = MotionTracker(calibration)
+    for pose in ([0.0] * 6, [0.0] * 7):
+        with pytest.raises(UsageError, match=r"^pose: expected"):
+            tracker.step(0, pose)
+    assert tracker.step(1, None).status == Status.INVALID
+
+
+def test_intervals_hold_what_they_state() -> None:
+    """New drives, whose noise differs from drive to drive as that of the calibration."""
+    noise = np.random.default_rng(0).uniform(0.5, 2.0, 36)
+    drives = [drive(100 + index, 200, each) for index, each in enumerate(noise)]
+    calibration = MotionCalibration(
+        conformalize(drives[:18], "test", HORIZONS[:2], [Horizon.parse("2s")])
+    )
+    shares, tubes = {}, {}
+    for rule in MOTION_RULES:
+        report = audit(calibration, calibration.level(0.9, rule), drives[18:])
+        shares[rule] = np.mean([x.position for each in report.recordings for x in each.horizons])
+        whole = [x.position for each in report.recordings for x in each.windows]
+        tubes[rule] = np.mean(whole)
+    assert 0.85 <= shares["mean"] <= 0.95
+    assert 0.8 <= tubes["mean"] <= 0.97
+    assert shares["hierarchical"] >= shares["capped"] >= shares["mean"]
+    assert shares["tolerance"] >= 0.93
+
+
+def test_formats_are_told_by_their_lines(tmp_path: Path) -> None:
+    pair = drive(23, 30)
+    table = np.column_stack([1e-9 * pair.stamps_ns, pair.estimate])
+    np.savetxt(tmp_path / "a.tum", table, fmt="%.9f")
+    variances = np.tile([4.0, 0, 0, 4, 0, 1, 9, 0, 0, 0, 0, 0], (31, 1))
+    np.savetxt(tmp_path / "b.txt", np.column_stack([table, variances]), fmt="%.9f")
+    names = "timestamp tx ty tz qx qy qz qw inliers"
+    np.savetxt(
+        tmp_path / "c.txt", np.column_stack([table, np.arange(31)]), fmt="%.9f", header=names
+    )
+    plain = read_poses(tmp_path / "a.tum")
+    assert plain.format == "tum"
+    openvins = read_poses(tmp_path / "b.txt")
+    assert openvins.format == "openvins"
+    assert {name: values[0] for name, values in openvins.columns.items()} == {
+        "position_deviation": 3.0,
+        "rotation_deviation": 3.0,
+    }
+    more = read_poses(tmp_path / "c.txt")
+    np.testing.assert_array_equal(more.columns["inliers"], np.arange(31))
+    for each in (openvins, more):
+        np.testing.assert_array_equal(each.poses, plain.poses)
+    (tmp_path / "d.txt").write_text("1 2 3\n")
+    with pytest.raises(SourceError, match="found 3 columns in line 1"):
+        read_poses(tmp_path / "d.txt")
+    assert len(OPENVINS_FORM.split()) == 20
+
+
+def test_from_files_to_intervals_and_an_audit(tmp_path: Path) -> None:
+    drives = [drive(30 + seed) for seed in range(4)]
+    files = [written(pair, tmp_path) for pair in drives]
+    motion = tmp_path / "motion.json"
+    given = [path for two in files[:3] for path in two]
+    code, text = run("conformalize", *given, "-o", motion, "--horizon", "1f,1s", "--window", "5s")
+    assert code == 0, text
+    assert "drive-30" in text
+    output = tmp_path / "a.jsonl"
+    assert run("annotate", files[3][0], motion, "-o", output)[0] == 0
+    header, *lines = output.read_bytes().splitlines()
+    assert msgspec.json.decode(header, type=MotionHeader).horizons == ("1f", "1s")
+    records = [msgspec.json.decode(line, type=MotionRecord) for line in lines]
+    assert len(records) == 401
+    assert [each.bounded for each in records[-1].motion] == [True, True]
+    assert run("audit", *files[3], motion, "--min-coverage", 0.5)[0] == 0
+    assert run("audit", *files[3], motion, "--min-coverage", 1)[0] == 8
+
+
+def test_every_format_has_every_pose(tmp_path: Path, file: MotionFile) -> None:
+    motion, pair = tmp_path / "motion.json", drive(1, 60)
+    motion.write_bytes(encode_motion_file(file))
+    estimate, _ = written(pair, tmp_path)
+    rows = tmp_path / "a.csv"
+    assert run("annotate", estimate, motion, "-o", rows, "--covariance", "interval")[0] == 0
+    lines = [line for line in rows.read_text().splitlines() if not line.startswith("#")]
+    assert len(lines) == 1 + 61 * len(HORIZONS)
+    assert {len(line.split(",")) for line in lines} == {len(lines[0].split(","))}
+    poses = tmp_path / "a.tum"
+    assert run("annotate", estimate, motion, "-o", poses)[0] == 0
+    np.testing.assert_allclose(read_poses(poses).poses, read_poses(estimate).poses, atol=1e-8)
+    whole, piped = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
+    assert run("annotate", estimate, motion, "-o", whole, "--covariance", "integrated")[0] == 0
+    words = ["annotate", "-", str(motion), "-o", str(piped), "--covariance", "integrated"]
+    done = CliRunner().invoke(app, words, input=estimate.read_text())
+    assert done.exit_code == 0, done.output
+    files = (path.read_bytes().splitlines() for path in (whole, piped))
+    for one, other in zip(*files, strict=True):
+        same(msgspec.json.decode(one), msgspec.json.decode(other))
+    assert msgspec.json.decode(one, type=MotionRecord).covariance
+
+
+def test_a_picture_shows_path_errors_and_coverage(tmp_path: Path, file: MotionFile) -> None:
+    pytest.importorskip("matplotlib")
+    motion, pair = tmp_path / "motion.json", drive(1, 200)
+    motion.write_bytes(encode_motion_file(file))
+    estimate, truth = written(pair, tmp_path)
+    picture = tmp_path / "a.png"
+    assert run("audit", estimate, truth, motion, "--picture", picture)[0] == 0
+    image = cv2.imread(str(picture))
+    assert image is not None
+    # Not one colour: something was drawn in each of the three panels.
+    assert all(panel.std() > 5.0 for panel in np.array_split(image, 3, axis=1))
+
+
+def test_the_schema_accepts_the_file_and_nothing_else(file: MotionFile) -> None:
+    code, text = run("schema", "motion")
+    assert code == 0
+    document = json.loads(encode_motion_file(file))
+    properties = json.loads(text)["$defs"]["MotionFile"]
+    assert set(properties["properties"]) == set(document)
+    assert properties["additionalProperties"] is False
+
+
+def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -> None:
+    motion = tmp_path / "motion.json"
+    motion.write_bytes(encode_motion_file(file))
+    one, other = (written(drive(seed), tmp_path) for seed in (40, 41))
+    apart = np.loadtxt(one[1])
+    apart[:, 0] += 1000.0
+    np.savetxt(tmp_path / "apart.tum", apart, fmt="%.9f")
+    large = np.loadtxt(one[0])
+    large[:, 1:4] *= 1000.0
+    np.savetxt(tmp_path / "mm.tum", large, fmt="%.9f")
+    (tmp_path / "corrupt.json").write_bytes(motion.read_bytes()[:-40])
+    output = ["-o", tmp_path / "out.json"]
+    cases = [
+        (["conformalize", *one, *output], 2, "at least two drives, found 1"),
+        (["conformalize", one[0], *output], 2, "expected pairs EST GT, found 1"),
+        (["conformalize", *output], 2, "expected EST GT"),
+        (["conformalize", one[0], tmp_path / "apart.tum", *other, *output], 6, "found 0 of 401"),
+        (["conformalize", tmp_path / "mm.tum", one[1], *other, *output], 6, "expected metres"),
+        (["conformalize", *one, *other, *output, "--horizon", "9m,1000m"], 2, "horizon 1000m"),
+        (["conformalize", *one, *other, *output, "--horizon", "7x"], 2, "horizon: expected"),
+        (["conformalize", *one, *other, *output, "--window", "1000s"], 2, "window 1000s"),
+        (["conformalize", *one, *other, *output, "--scale", "inliers"], 2, "column inliers"),
+        (["conformalize", *one, *other, "-o", one[0]], 2, "among the inputs"),
+        (["audit", *one, tmp_path / "corrupt.json"], 3, "corrupt.json"),
+        (["audit", *one, tmp_path / "none.json"], 3, "no such file"),
+        (["annotate", one[0], motion, "--confidence", "0.7"], 2, "confidence: expected"),
+        (["annotate", tmp_path / "none.tum", motion], 6, "none.tum"),
+    ]
+    for words, code, message in cases:
+        found, text = run(*words)
+        assert (found, message in text) == (code, True), (words, text)
+    assert not (tmp_path / "out.json").exists()
