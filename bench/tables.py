@@ -20,6 +20,7 @@ from pathlib import Path
 import accuracy_tables
 import comparison_tables
 import localiser_tables
+import motion_tables
 import promised_table
 import reconstruct_tables
 import recording_tables
@@ -52,6 +53,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **speed_tables.TABLES,
     **vigilance_tables.TABLES,
     **promised_table.TABLES,
+    **motion_tables.TABLES,
     **recording_tables.TABLES,
     **reconstruct_tables.TABLES,
     "faults": faults,

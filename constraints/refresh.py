@@ -16,7 +16,10 @@ from packaging.version import Version
 
 FOLDER = Path(__file__).resolve().parent
 ROOTS = {
-    "runtime.txt": ("cvo-edge[openvino,plot,rosbag,sign]", "pip install -c constraints/runtime.txt ."),
+    "runtime.txt": (
+        "cvo-edge[openvino,plot,rosbag,sign]",
+        "pip install -c constraints/runtime.txt .",
+    ),
     "export.txt": (
         "cvo-export[plot,ray,reconstruct,rosbag]",
         "pip install -c constraints/export.txt . ./export",

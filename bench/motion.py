@@ -1,0 +1,331 @@
+"""Intervals on the motion of public estimators, one drive left out at a time.
+
+    python bench/motion.py [--sets kitti_lidar euroc_vio]
+
+Trajectories come from ``CVO_DATA/trajectories``. KITTI has no times: 9.65 poses a second. EuRoC's
+truths are moved by the time offset that ``conformalize`` finds. For each drive, thresholds are
+learned on all others. Results: ``results/motion/SET.json``.
+
+``width`` is the mean width over that of plain errors (``--scale none``); ``tolerance`` the share of
+drives of which at least 90 % is inside, and the width over that of ``hierarchical``; ``hardest``
+the coverage in the quarter of a drive's motions with the largest predicted scale. ``injected``:
+what is found of a time offset, a turned body frame and a scale that were put in, beyond what is
+found without. Times are processor time of this process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from provenance import RESULTS, write_result
+
+from cvo_edge import geometry
+from cvo_edge.motion.audit import RecordingAudit, audit
+from cvo_edge.motion.conformalize import conformalize, trace_of
+from cvo_edge.motion.corrections import fit_of
+from cvo_edge.motion.format import MotionFile, encode_motion_file
+from cvo_edge.motion.intervals import Level, MotionCalibration, MotionWindow
+from cvo_edge.motion.pairs import Pair
+from cvo_edge.motion.relative import motion, norms, residual
+from cvo_edge.motion.thresholds import Scores
+from cvo_edge.motion.tracker import annotate
+from cvo_edge.motion.windows import window_errors
+from cvo_edge.programs.trajectories import Files, Reading, correct_pairs, fits, read_pairs
+from cvo_edge.vocabulary import MOTION_RULES, MotionCorrection
+
+Array = NDArray[np.float64]
+
+DATA = Path(os.environ.get("CVO_DATA", "data")) / "trajectories"
+LEVEL = 0.9
+
+
+def kitti() -> list[Pair]:
+    """Return the pairs of KITTI 00 to 10."""
+    folder = DATA / "kitti_lidar"
+    files = [
+        Files(path, folder / "groundtruth" / path.name)
+        for path in sorted((folder / "estimate").glob("*.txt"))
+    ]
+    return read_pairs(files, Reading(fps=9.65))
+
+
+def euroc() -> list[Pair]:
+    """Return both runs of each EuRoC drive."""
+    files = [
+        Files(folder / f"estimate{run}.txt", folder / "groundtruth.txt")
+        for folder in sorted((DATA / "euroc_vio").iterdir())
+        for run in (0, 1)
+    ]
+    return read_pairs(files, Reading())
+
+
+SETS: dict[str, tuple[Any, tuple[MotionCorrection, ...]]] = {
+    "kitti_lidar": (kitti, ()),
+    "euroc_vio": (euroc, ("time",)),
+}
+
+
+def alignments(pairs: Sequence[Pair]) -> list[dict[str, Any]]:
+    """Return what the alignment report finds of each pair."""
+    report = []
+    for pair, fit in zip(pairs, fits(pairs), strict=True):
+        found = fit.alignment
+        report.append(
+            {
+                "name": pair.name,
+                "offset_ms": 1e3 * found.offset_s,
+                "offset_error_ms": 1e3 * found.offset_error_s,
+                "rotation_deg": np.rad2deg(found.determined_rotation).tolist(),
+                "undetermined": found.undetermined.tolist(),
+                "scale": found.scale,
+                "worth": [name for name, effect in fit.effects.items() if effect.worth],
+            }
+        )
+    return report
+
+
+def injected(pairs: Sequence[Pair]) -> dict[str, Any]:
+    """Put faults into each pair; return the largest error of what is found, and what is named."""
+    turn = geometry.quaternion_exp(np.deg2rad([0.0, 1.5, 0.0]))
+    errors: dict[str, list[float]] = {}
+    named: dict[str, list[bool]] = {}
+    for pair in pairs:
+        plain = pair.aligned()
+        if plain is None:
+            continue
+        turned, larger = pair.estimate.copy(), pair.estimate.copy()
+        turned[:, 3:] = geometry.quaternion_multiply(turned[:, 3:], turn)
+        larger[:, :3] *= 1.02
+        cases = {
+            **{
+                f"{ms} ms": replace(pair, stamps_ns=pair.stamps_ns + 1_000_000 * ms)
+                for ms in (50, 100)
+            },
+            "1.5 deg": replace(pair, estimate=turned),
+            "2 %": replace(pair, estimate=larger),
+        }
+        for name, case in cases.items():
+            found = case.aligned()
+            if found is None:
+                continue
+            fit = fit_of(case, found)
+            if name.endswith("ms"):
+                error = 1e3 * (found.offset_s - plain.offset_s) + float(name.split()[0])
+                kind: MotionCorrection = "time"
+            elif name == "1.5 deg":
+                before, after = (geometry.quaternion_exp(each.rotation) for each in (plain, found))
+                off = geometry.quaternion_log(
+                    geometry.quaternion_multiply(geometry.quaternion_conjugate(before), after)
+                )
+                # Only about axes about which the rotation is determined.
+                along = plain.axes[plain.rotation_error_deg <= 0.5]
+                error = float(np.rad2deg(np.abs(along @ (off - np.deg2rad([0, 1.5, 0]))).max()))
+                kind = "frame"
+            else:
+                error = 100.0 * (found.scale / plain.scale * 1.02 - 1.0)
+                kind = "scale"
+            errors.setdefault(name, []).append(abs(error))
+            named.setdefault(name, []).append(fit.effects[kind].worth)
+    return {
+        name: {"largest_error": max(each), "named": sum(named[name]), "of": len(each)}
+        for name, each in errors.items()
+    }
+
+
+def left_out(pairs: Sequence[Pair]) -> dict[str, Any]:
+    """Learn on all drives but one, for each; return what holds on that one."""
+    drives = sorted({pair.group for pair in pairs})
+    found: dict[str, list[dict[str, Any]]] = {}
+    audits: list[RecordingAudit] = []
+    tubes: dict[str, list[Array]] = {}
+    for drive in drives:
+        others = [pair for pair in pairs if pair.group != drive]
+        own = [pair for pair in pairs if pair.group == drive]
+        fitted, plain = (
+            MotionCalibration(conformalize(others, "bench", learned=learned))
+            for learned in (True, False)
+        )
+        for index, horizon in enumerate(fitted.horizons):
+            row = one_drive(fitted, plain, index, own)
+            if row is not None:
+                found.setdefault(horizon.spec.horizon, []).append(row)
+        audits += audit(fitted, Level(LEVEL), own).recordings
+        for window in fitted.windows:
+            bands = bands_of(window, others, fitted)
+            tubes.setdefault(window.spec.window, []).append(window.mean_radii(Level()) / bands)
+    return {
+        "horizons": [summary(name, rows) for name, rows in found.items()],
+        "tubes": [tube(name, ratios, audits) for name, ratios in tubes.items()],
+        "covariances": covariances(audits),
+    }
+
+
+def bands_of(window: MotionWindow, pairs: Sequence[Pair], calibration: MotionCalibration) -> Array:
+    """Return the mean over a window of the errors (2,) that 90 % of motions do not exceed."""
+    places = np.linspace(0.04, 1.0, 25) * window.window.value
+    parts = []
+    for pair in pairs:
+        rows = trace_of(pair, calibration.limits, ())
+        parts.append(window_errors(rows, pair.truth, window.window))
+    near = 0.5 * (places[1] - places[0])
+    bands = []
+    for place in places:
+        errors = [each.errors[np.abs(each.along - place) <= near] for each in parts]
+        used = [(each, pair.group) for each, pair in zip(errors, pairs, strict=True) if len(each)]
+        scores = Scores([each for each, _ in used], [group for _, group in used])
+        bands.append(scores.thresholds("mean", LEVEL))
+    return np.asarray(np.mean(bands, axis=0))
+
+
+def tube(name: str, ratios: list[Array], audits: Sequence[RecordingAudit]) -> dict[str, Any]:
+    """Return the share of windows inside, and the width over bands of single times."""
+    whole = [each for one in audits for each in one.windows if each.window == name and each.windows]
+    return {
+        "window": name,
+        "recordings": len(whole),
+        "inside": [
+            float(np.mean([each.position for each in whole])),
+            float(np.mean([each.rotation for each in whole])),
+        ],
+        "over_bands": np.mean(ratios, axis=0).tolist(),
+    }
+
+
+def covariances(audits: Sequence[RecordingAudit]) -> list[dict[str, Any]]:
+    """Return mean and median over recordings of NEES over six, and the mean share inside."""
+    rows: dict[tuple[str, str], list[Any]] = {}
+    for one in audits:
+        for each in one.horizons:
+            if each.motions:
+                rows.setdefault(("interval", each.horizon), []).append(each)
+        for span in one.integrated:
+            rows.setdefault(("integrated", f"{span.seconds:g}s"), []).append(span)
+    return [
+        {
+            "covariance": kind,
+            "over": over,
+            "nees": float(np.mean([each.nees for each in found])),
+            "nees_median": float(np.median([each.nees for each in found])),
+            "inside": float(np.mean([each.nees_inside for each in found])),
+        }
+        for (kind, over), found in rows.items()
+    ]
+
+
+def one_drive(
+    learned: MotionCalibration, plain: MotionCalibration, index: int, pairs: Sequence[Pair]
+) -> dict[str, Any] | None:
+    """Return coverage and widths of one drive at one horizon; None without motions."""
+    row: dict[str, Any] = {}
+    for rule in MOTION_RULES:
+        inside, widths, scales = measured(learned, index, Level(LEVEL, rule), pairs)
+        if not len(inside):
+            return None
+        row[rule] = {"coverage": inside.mean(axis=0), "width": widths.mean(axis=0)}
+        if rule == "mean":
+            hard = scales >= np.quantile(scales, 0.75, axis=0)
+            row["hardest"] = (inside & hard).sum(axis=0) / hard.sum(axis=0)
+    _, widths, _ = measured(plain, index, Level(LEVEL), pairs)
+    row["plain"] = widths.mean(axis=0)
+    return row
+
+
+def measured(
+    calibration: MotionCalibration, index: int, level: Level, pairs: Sequence[Pair]
+) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Return whether each of (n, 8) errors is inside, its half-width or radius, and its scale."""
+    parts = []
+    for pair in pairs:
+        rows = trace_of(pair, calibration.limits, ())
+        found, truth = calibration.horizons[index].intervals(rows, level), pair.truth
+        off = residual(found.moved, motion(truth[found.start], truth[found.end])) - found.bias
+        errors = np.concatenate([np.abs(off), norms(off)], axis=1)
+        width = np.concatenate([0.5 * (found.upper - found.lower), found.radii], axis=1)
+        known = np.isfinite(errors).all(axis=1)
+        parts.append((errors[known] <= width[known], width[known], found.scale[known]))
+    inside, widths, scales = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return inside, widths, scales
+
+
+def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Average over drives; pairs of numbers are those of position and rotation."""
+    rules = {}
+    hierarchical = np.mean([row["hierarchical"]["width"] for row in rows], axis=0)
+    for rule in MOTION_RULES:
+        coverage = np.array([row[rule]["coverage"] for row in rows])
+        width = np.mean([row[rule]["width"] for row in rows], axis=0)
+        rules[rule] = {
+            "coverage_dof": float(coverage[:, :6].mean()),
+            "coverage": coverage[:, 6:].mean(axis=0).tolist(),
+            "least": float(coverage[:, :6].mean(axis=1).min()),
+            "share": float((coverage >= LEVEL).mean()),
+            "over_hierarchical": float(np.mean(width / hierarchical))
+            if np.isfinite(hierarchical).all()
+            else None,
+            "width": width[6:].tolist(),
+        }
+    plain = np.mean([row["plain"] for row in rows], axis=0)
+    mean = np.mean([row["mean"]["width"] for row in rows], axis=0)
+    hardest = np.mean([row["hardest"] for row in rows], axis=0)
+    return {
+        "horizon": name,
+        "drives": len(rows),
+        "rules": rules,
+        "over_plain_dof": float(np.mean(mean[:6] / plain[:6])),
+        "over_plain": (mean[6:] / plain[6:]).tolist(),
+        "hardest_dof": float(hardest[:6].mean()),
+        "hardest": hardest[6:].tolist(),
+    }
+
+
+def costs(pairs: Sequence[Pair]) -> dict[str, Any]:
+    """Return processor times and the size of the file."""
+    start = time.process_time()
+    file: MotionFile = conformalize(pairs, "bench")
+    learned_s = time.process_time() - start
+    calibration = MotionCalibration(file)
+    start = time.process_time()
+    count = sum(
+        1
+        for pair in pairs
+        for _ in annotate(calibration, Level(), pair.stamps_ns, pair.estimate, {})
+    )
+    return {
+        "poses": count,
+        "conformalize_s": learned_s,
+        "annotate_us": 1e6 * (time.process_time() - start) / count,
+        "bytes": len(encode_motion_file(file)),
+    }
+
+
+def main() -> None:
+    """Measure the chosen sets."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sets", nargs="+", choices=SETS, default=list(SETS))
+    for name in parser.parse_args().sets:
+        read, wanted = SETS[name]
+        pairs = read()
+        corrected, _ = correct_pairs(pairs, fits(pairs), wanted)
+        report = {
+            "set": name,
+            "corrected": list(wanted),
+            "pairs": len(pairs),
+            "drives": len({pair.group for pair in pairs}),
+            "alignment": alignments(pairs),
+            "injected": injected(corrected),
+            **left_out(corrected),
+            "costs": costs(corrected),
+        }
+        write_result(RESULTS / "motion" / f"{name}.json", report)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+"""The tables of ``results/motion`` for ``bench/tables.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from markdown_table import table
+from provenance import read_result, result_files
+
+FOLDER = "motion"
+
+
+def results() -> list[dict[str, Any]]:
+    """Return the results of all sets."""
+    return [read_result(FOLDER, path.stem) for path in result_files(FOLDER)]
+
+
+def motion() -> str:
+    """One row for each set and horizon: what holds on a drive that was left out."""
+    return table(
+        [
+            "set", "horizon", "drives", "`mean`: each DoF, position, rotation", "worst drive",
+            "width over plain: DoF, position, rotation", "hardest quarter: DoF, position, rotation",
+            "`tolerance`: drives with 0.9 inside", "its width over `hierarchical`",
+        ],
+        [row(found, each) for found in results() for each in found["horizons"]],
+    )  # fmt: skip
+
+
+def row(found: dict[str, Any], horizon: dict[str, Any]) -> list[str]:
+    """Return the cells of one horizon."""
+    mean, tolerance = horizon["rules"]["mean"], horizon["rules"]["tolerance"]
+    over = tolerance["over_hierarchical"]
+    return [
+        found["set"],
+        horizon["horizon"],
+        str(horizon["drives"]),
+        three(mean["coverage_dof"], mean["coverage"]),
+        f"{mean['least']:.2f}",
+        three(horizon["over_plain_dof"], horizon["over_plain"]),
+        three(horizon["hardest_dof"], horizon["hardest"]),
+        f"{tolerance['share']:.2f}",
+        "-" if over is None else f"{over:.2f}",
+    ]
+
+
+def three(dof: float, pair: list[float]) -> str:
+    """Return the mean over degrees of freedom, then position and rotation."""
+    return f"{dof:.3f}, {pair[0]:.3f}, {pair[1]:.3f}"
+
+
+def tubes() -> str:
+    """One row for each set and window."""
+    return table(
+        ["set", "window", "recordings", "whole windows inside: position, rotation",
+         "width over bands of single times: position, rotation"],
+        [
+            [
+                found["set"],
+                each["window"],
+                str(each["recordings"]),
+                f"{each['inside'][0]:.3f}, {each['inside'][1]:.3f}",
+                f"{each['over_bands'][0]:.2f}, {each['over_bands'][1]:.2f}",
+            ]
+            for found in results()
+            for each in found["tubes"]
+        ],
+    )  # fmt: skip
+
+
+def covariances() -> str:
+    """One row for each covariance and time, both sets side by side."""
+    sets = results()
+    by_set = [
+        {(each["covariance"], each["over"]): each for each in found["covariances"]}
+        for found in sets
+    ]
+    return table(
+        ["covariance", "over", *(f"{found['set']}: NEES / 6 (median), inside" for found in sets)],
+        [
+            [
+                *key,
+                *(
+                    f"{each[key]['nees']:.2f} ({each[key]['nees_median']:.2f}), "
+                    f"{each[key]['inside']:.2f}"
+                    for each in by_set
+                ),
+            ]
+            for key in by_set[0]
+        ],
+    )
+
+
+def alignment() -> str:
+    """One row for each set: what the report finds, of itself and of faults that were put in."""
+    rows = []
+    for found in results():
+        for kind, each in found["injected"].items():
+            unit = kind.split()[1]
+            rows.append(
+                [
+                    found["set"],
+                    kind,
+                    f"{each['largest_error']:.2g} {unit}",
+                    f"{each['named']} of {each['of']}",
+                ]
+            )
+    return table(["set", "put in", "largest error of what is found", "said to be worth it"], rows)
+
+
+def costs() -> str:
+    """One row for each set: processor time and size."""
+    return table(
+        ["set", "poses", "`conformalize`, s", "`annotate`, us a pose", "file, bytes"],
+        [
+            [
+                found["set"],
+                f"{found['costs']['poses']:,}",
+                f"{found['costs']['conformalize_s']:.2f}",
+                f"{found['costs']['annotate_us']:.0f}",
+                f"{found['costs']['bytes']:,}",
+            ]
+            for found in results()
+        ],
+    )
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "motion": motion,
+    "motion-alignment": alignment,
+    "motion-tubes": tubes,
+    "motion-covariances": covariances,
+    "motion-costs": costs,
+}
