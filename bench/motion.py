@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from provenance import RESULTS, write_result
 
 from cvo_edge import geometry
+from cvo_edge.motion.adaptation import MotionAdaptation
 from cvo_edge.motion.audit import RecordingAudit, audit
 from cvo_edge.motion.conformalize import conformalize, trace_of
 from cvo_edge.motion.corrections import fit_of
@@ -45,6 +46,9 @@ Array = NDArray[np.float64]
 
 DATA = Path(os.environ.get("CVO_DATA", "data")) / "trajectories"
 LEVEL = 0.9
+# Seconds from a pose to its truth.
+DELAYS_S = (0.0, 1.0, 10.0, 60.0)
+LEAST_ONLINE = 100
 
 
 def kitti() -> list[Pair]:
@@ -146,6 +150,7 @@ def left_out(pairs: Sequence[Pair]) -> dict[str, Any]:
     found: dict[str, list[dict[str, Any]]] = {}
     audits: list[RecordingAudit] = []
     tubes: dict[str, list[Array]] = {}
+    adapted: list[dict[str, Any]] = []
     for drive in drives:
         others = [pair for pair in pairs if pair.group != drive]
         own = [pair for pair in pairs if pair.group == drive]
@@ -158,6 +163,7 @@ def left_out(pairs: Sequence[Pair]) -> dict[str, Any]:
             if row is not None:
                 found.setdefault(horizon.spec.horizon, []).append(row)
         audits += audit(fitted, Level(LEVEL), own).recordings
+        adapted += online(fitted, own)
         for window in fitted.windows:
             bands = bands_of(window, others, fitted)
             tubes.setdefault(window.spec.window, []).append(window.mean_radii(Level()) / bands)
@@ -165,7 +171,63 @@ def left_out(pairs: Sequence[Pair]) -> dict[str, Any]:
         "horizons": [summary(name, rows) for name, rows in found.items()],
         "tubes": [tube(name, ratios, audits) for name, ratios in tubes.items()],
         "covariances": covariances(audits),
+        "online": online_summary(adapted),
     }
+
+
+def online(calibration: MotionCalibration, pairs: Sequence[Pair]) -> Iterator[dict[str, Any]]:
+    """Yield coverage and width of thresholds that follow truths, by horizon and delay.
+
+    Widths are over those of the best constant threshold of the drive itself.
+    """
+    for pair in pairs:
+        rows, truth = trace_of(pair, calibration.limits, ()), pair.truth
+        for horizon in calibration.horizons:
+            found = horizon.intervals(rows, Level(LEVEL))
+            off = residual(found.moved, motion(truth[found.start], truth[found.end])) - found.bias
+            known = np.isfinite(off).all(axis=1)
+            if known.sum() < LEAST_ONLINE:
+                continue
+            errors = np.concatenate([np.abs(off), norms(off)], axis=1)
+            width = np.concatenate([0.5 * (found.upper - found.lower), found.radii], axis=1)
+            scores, ends = (errors / width)[known], found.end[known]
+            spans = (found.end - found.start)[known]
+            best = np.quantile(scores, LEVEL, axis=0)
+            for delay_s in DELAYS_S:
+                late = round(delay_s / calibration.limits.period_s)
+                adapting = MotionAdaptation(1.0 - LEVEL, joint=False)
+                x = np.zeros_like(scores)
+                for place in range(len(scores)):
+                    x[place] = adapting.x
+                    if (label := place - late) >= 0:
+                        newest, span = int(ends[place]), int(spans[label])
+                        adapting.update(int(ends[label]), newest, span, scores[label])
+                factor = np.exp(x)
+                yield {
+                    "over": horizon.spec.horizon,
+                    "delay_s": delay_s,
+                    "inside": float((scores <= factor).mean()),
+                    "width": float((factor.mean(axis=0) / best).mean()),
+                    "widest": float((factor / best).max()),
+                }
+
+
+def online_summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return mean and worst drive for each horizon and delay."""
+    found: dict[tuple[str, float], list[dict[str, Any]]] = {}
+    for row in rows:
+        found.setdefault((row["over"], row["delay_s"]), []).append(row)
+    return [
+        {
+            "over": over,
+            "delay_s": delay_s,
+            "inside": float(np.mean([row["inside"] for row in each])),
+            "worst": min(row["inside"] for row in each),
+            "width": float(np.mean([row["width"] for row in each])),
+            "widest": max(row["widest"] for row in each),
+        }
+        for (over, delay_s), each in found.items()
+    ]
 
 
 def bands_of(window: MotionWindow, pairs: Sequence[Pair], calibration: MotionCalibration) -> Array:

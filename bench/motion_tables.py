@@ -92,6 +92,31 @@ def covariances() -> str:
     )
 
 
+def online() -> str:
+    """One row for each horizon and delay, both sets side by side."""
+    sets = results()
+    by_set = [{(each["over"], each["delay_s"]): each for each in one["online"]} for one in sets]
+    keys = dict.fromkeys(key for each in by_set for key in each)
+    return table(
+        ["horizon", "delay", *(f"{one['set']}: inside, worst drive, width" for one in sets)],
+        [
+            [
+                over,
+                f"{delay_s:g} s",
+                *(
+                    f"{each[over, delay_s]['inside']:.2f}, {each[over, delay_s]['worst']:.2f}, "
+                    f"{each[over, delay_s]['width']:.2f} x (at most "
+                    f"{each[over, delay_s]['widest']:.0f} x)"
+                    if (over, delay_s) in each
+                    else "-"
+                    for each in by_set
+                ),
+            ]
+            for over, delay_s in keys
+        ],
+    )
+
+
 def alignment() -> str:
     """One row for each set: what the report finds, of itself and of faults that were put in."""
     rows = []
@@ -131,5 +156,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "motion-alignment": alignment,
     "motion-tubes": tubes,
     "motion-covariances": covariances,
+    "motion-online": online,
     "motion-costs": costs,
 }

@@ -235,15 +235,18 @@ class MotionTracker:
             del self._truths[next(iter(self._truths))]
         covered = []
         for horizon, adaptation in zip(self.calibration.horizons, self._adaptations, strict=True):
-            scores = self._scores(rows, horizon, end)
+            found = self._scores(rows, horizon, end)
             inside = None
-            if scores is not None:
-                inside = adaptation.update(seq, self._kept.numbers[-1], scores)
+            if found is not None:
+                inside = adaptation.update(seq, self._kept.numbers[-1], *found)
             covered.append(None if inside is None else tuple(inside.tolist()))
         return MotionUpdate(tuple(covered), tuple(tuple(each.tolist()) for each in self._factors()))
 
-    def _scores(self, rows: Rows, horizon: MotionHorizon, end: int) -> Array | None:
-        """Return the scores (8,) of a motion over its calibrated thresholds; None without truth."""
+    def _scores(self, rows: Rows, horizon: MotionHorizon, end: int) -> tuple[int, Array] | None:
+        """Return the rows of a motion and its scores (8,) over calibrated thresholds.
+
+        None if the truth is not known at both ends.
+        """
         found = horizon.intervals(rows, self.level, np.array([end]))
         if not len(found.end):
             return None
@@ -254,7 +257,7 @@ class MotionTracker:
         off = residual(found.moved, motion(first, last)[np.newaxis]) - found.bias
         widths = np.concatenate([0.5 * (found.upper - found.lower), found.radii], axis=1)
         scores = eight(off)[0] / widths[0]
-        return scores if np.isfinite(off).all() else None
+        return (end - int(found.start[0]), scores) if np.isfinite(off).all() else None
 
     def _factors(self) -> list[Array]:
         return [np.exp(each.x) for each in self._adaptations or ()]
