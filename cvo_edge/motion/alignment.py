@@ -45,10 +45,15 @@ LEAST_MOTIONS = 50
 _MOST_MOTIONS = 2000
 _MOST_COARSE = 400
 _LEAST_NOISE = 1e-9
+# A body whose usual rotation (rad) and translation (m) in half a second are below these stands.
+_LEAST_MOTION = np.array([2e-3, 2e-3])
 
 
 class Alignment(NamedTuple):
     """What was found of one pair, with standard errors.
+
+    ``misfit``: root mean square of what is left of rotations and of translations, on the motions
+    that fit best, over that of the motions themselves (2,).
 
     Attributes
     ----------
@@ -70,6 +75,7 @@ class Alignment(NamedTuple):
     axes: Array
     scale: float
     scale_error: float
+    misfit: Array
 
     @property
     def undetermined(self) -> Array:
@@ -119,7 +125,7 @@ def align(stamps_ns: Integers, estimate: Array, truth: Track) -> Alignment | Non
         return None
     pair = _Pair(stamps_ns, estimate, truth)
     offset_ns = pair.coarse_offset()
-    if offset_ns is None:
+    if offset_ns is None or pair.stands(offset_ns):
         return None
     trues = [pair.truth_at(offset_ns + k * pair.step_ns) for k in (-1, 0, 1)]
     known = trues[0].known & trues[1].known & trues[2].known
@@ -148,6 +154,7 @@ def align(stamps_ns: Integers, estimate: Array, truth: Track) -> Alignment | Non
         axes.T,
         best.scale,
         float(np.sqrt(_jackknife([each.solution.scale for each in others])[0, 0])),
+        best.noise / np.maximum([_rms(true.w[known]), _rms(true.t[known])], _LEAST_MOTION),
     )
 
 
@@ -178,6 +185,12 @@ class _Pair:
         both = np.concatenate([first[::every], last[::every]]) + round(offset_ns)
         poses, _ = self._truth.poses_at(both, self._bound_ns)
         return _twists(motion(*np.split(poses, 2)))
+
+    def stands(self, offset_ns: float) -> bool:
+        """Whether the truth neither turns nor moves."""
+        true = self.truth_at(offset_ns)
+        usual = np.array([_rms(true.w[true.known]), _rms(true.t[true.known])])
+        return bool((usual < _LEAST_MOTION).all())
 
     def coarse_offset(self) -> float | None:
         """Return the offset at which speeds and turn rates fit best; None if nothing does."""

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from cvo_edge.errors import UsageError
+from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.motion.conformalize import trace_of
 from cvo_edge.motion.covariance import CHI_SQUARE, SPANS_S, nees, sums_of
 from cvo_edge.motion.drift import Running
@@ -104,6 +104,19 @@ class Audit(Struct, frozen=True):
     statement: str
     recordings: tuple[RecordingAudit, ...]
     calibrated_on: tuple[str, ...]
+    horizons: tuple[str, ...]
+
+    def failure(self, least: float) -> str | None:
+        """Return why the coverage is not at least this at every horizon, or None."""
+        for horizon in self.horizons:
+            coverage = self.coverage(horizon)
+            found = "no motion" if coverage is None else f"{coverage:.3f}"
+            if coverage is None or coverage < least:
+                return (
+                    f"expected a coverage of at least {least:g} at every horizon, found {found} at "
+                    f"{horizon}"
+                )
+        return None
 
     def coverage(self, horizon: str) -> float | None:
         """Return the coverage at a horizon, averaged over recordings; None without motions.
@@ -122,7 +135,8 @@ class Audit(Struct, frozen=True):
 def audit(calibration: MotionCalibration, level: Level, pairs: Sequence[Pair]) -> Audit:
     """Compare the intervals of recordings with their truth.
 
-    Raises UsageError if a column of the scale is missing.
+    Raises UsageError if a column of the scale is missing, and SourceError if no recording has a
+    motion over any horizon.
     """
     recordings, known = [], []
     for pair in pairs:
@@ -130,7 +144,7 @@ def audit(calibration: MotionCalibration, level: Level, pairs: Sequence[Pair]) -
         if missing:
             raise UsageError(f"{pair.name}: expected the column {missing[0]}, found none")
         rows = trace_of(scaled(calibration, pair), calibration.limits, calibration.file.columns)
-        if _known(calibration, pair, rows):
+        if _known(calibration, rows):
             known.append(pair.name)
         truth = pair.truth
         differs = not calibration.same_rate(1e-9 * float(np.median(np.diff(pair.stamps_ns))))
@@ -151,6 +165,12 @@ def audit(calibration: MotionCalibration, level: Level, pairs: Sequence[Pair]) -
                 tuple(_integrated(calibration, rows, truth)),
             )
         )
+    if not any(each.motions for one in recordings for each in one.horizons):
+        raise SourceError(
+            f"{pairs[0].name}: expected motions over {calibration.file.horizons[0].horizon} or "
+            "another horizon with a truth at both ends, found none: all poses are missing, or too "
+            "far apart in time or space for this calibration"
+        )
     file = calibration.file
     return Audit(
         file.name,
@@ -161,6 +181,7 @@ def audit(calibration: MotionCalibration, level: Level, pairs: Sequence[Pair]) -
         calibration.statement(level),
         tuple(recordings),
         tuple(known),
+        tuple(spec.horizon for spec in file.horizons),
     )
 
 
@@ -178,13 +199,11 @@ def _given(calibration: MotionCalibration, rows: Rows) -> Integers:
     return ends[[value is None or value <= limit for value in running]]
 
 
-def _known(calibration: MotionCalibration, pair: Pair, rows: Rows) -> bool:
+def _known(calibration: MotionCalibration, rows: Rows) -> bool:
     """Whether a recording is, by its time and path, one of those that were calibrated on."""
     seconds, metres = 1e-9 * float(rows.stamps_ns[-1] - rows.stamps_ns[0]), float(rows.path_m[-1])
     return any(
-        each.name.rpartition("/")[2] == pair.name.rpartition("/")[2]
-        and abs(each.seconds - seconds) <= 1e-3 * seconds
-        and abs(each.metres - metres) <= 1e-3 * metres
+        abs(each.seconds - seconds) <= 1e-3 * seconds and abs(each.metres - metres) <= 1e-3 * metres
         for each in calibration.file.recordings
     )
 

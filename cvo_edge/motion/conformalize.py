@@ -39,8 +39,6 @@ Array = NDArray[np.float64]
 
 DEFAULT_HORIZONS = tuple(map(Horizon.parse, ("1f", "1s", "5s", "10m", "100m")))
 DEFAULT_WINDOWS = tuple(map(Horizon.parse, ("10s", "100m")))
-# By default, two drives have to be so many times as long as a horizon or window.
-_TIMES = 1.5
 # A recording with fewer motions over a horizon is left out there.
 _LEAST_MOTIONS = 20
 # Bias and scale have some twenty numbers each. So many motions that do not overlap fix them.
@@ -106,14 +104,14 @@ def conformalize(
         _Recording(pair.group, trace_of(pair, limits, columns), pair.truth) for pair in ordered
     ]
     specs = [
-        _horizon(horizon, recordings, learned)
+        found
         for horizon in (DEFAULT_HORIZONS if horizons is None else horizons)
-        if horizons is not None or _two_drives(_long_enough(horizon, recordings))
+        if (found := _horizon(horizon, recordings, learned, needed=horizons is not None))
     ]
     tubes = [
-        _window(window, recordings)
+        tube
         for window in (DEFAULT_WINDOWS if windows is None else windows)
-        if windows is not None or _two_drives(_long_enough(window, recordings))
+        if (tube := _window(window, recordings, needed=windows is not None))
     ]
     if not specs:
         raise UsageError(
@@ -144,21 +142,30 @@ class _Recording(NamedTuple):
     truth: Array
 
 
-def _long_enough(horizon: Horizon, recordings: Sequence[_Recording]) -> list[_Recording]:
-    """Return the recordings that are clearly longer than a horizon or window."""
-    return [each for each in recordings if _extent(horizon, each.rows) >= _TIMES * horizon.value]
-
-
 def _two_drives(recordings: Sequence[_Recording]) -> bool:
     return len({each.group for each in recordings}) > 1
 
 
 def _too_short(what: str, horizon: Horizon, recordings: Sequence[_Recording]) -> UsageError:
-    longest = max(_extent(horizon, each.rows) for each in recordings)
+    longest = max(_longest_part(horizon, each.rows) for each in recordings)
     return UsageError(
-        f"{what} {horizon}: expected at least two drives that are long enough for it, with a truth "
-        f"throughout; the longest recording is {longest:.4g}{horizon.unit}"
+        f"{what} {horizon}: expected at least two drives with {_LEAST_MOTIONS} motions over it "
+        "whose truth is known, found fewer; the longest part between gaps, jumps and lost poses is "
+        f"{longest:.4g}{horizon.unit}, poses are {_step(horizon, recordings):.3g}{horizon.unit} "
+        "apart"
     )
+
+
+def _longest_part(horizon: Horizon, rows: Rows) -> float:
+    along = horizon.along(rows.stamps_ns, rows.path_m)
+    begin = np.flatnonzero(np.diff(rows.part, prepend=-1))
+    end = np.append(begin[1:], len(along)) - 1
+    return float((along[end] - along[begin]).max())
+
+
+def _step(horizon: Horizon, recordings: Sequence[_Recording]) -> float:
+    steps = [np.diff(horizon.along(each.rows.stamps_ns, each.rows.path_m)) for each in recordings]
+    return float(np.median(np.concatenate(steps)))
 
 
 def limits_of(pairs: Sequence[Pair]) -> Limits:
@@ -191,11 +198,16 @@ def trace_of(pair: Pair, limits: Limits, columns: Sequence[str]) -> Rows:
     return rows_of(pair.stamps_ns, pair.estimate, values, limits)
 
 
-def _horizon(horizon: Horizon, recordings: Sequence[_Recording], learned: bool) -> HorizonSpec:
+def _horizon(
+    horizon: Horizon, recordings: Sequence[_Recording], learned: bool, *, needed: bool
+) -> HorizonSpec | None:
+    """Calibrate a horizon; without two drives for it, return None or, if needed, raise."""
     found = [errors_of(each.rows, each.truth, horizon) for each in recordings]
     used = [index for index, each in enumerate(found) if len(each.end) >= _LEAST_MOTIONS]
     if not _two_drives([recordings[index] for index in used]):
-        raise _too_short("horizon", horizon, recordings)
+        if needed:
+            raise _too_short("horizon", horizon, recordings)
+        return None
     groups = [recordings[index].group for index in used]
     errors = [found[index] for index in used]
     apart = sum(_extent(horizon, recordings[index].rows) / horizon.value for index in used)
@@ -263,11 +275,16 @@ def _integrated(
     return a, b, c, d, e, f
 
 
-def _window(window: Horizon, recordings: Sequence[_Recording]) -> WindowSpec:
+def _window(
+    window: Horizon, recordings: Sequence[_Recording], *, needed: bool
+) -> WindowSpec | None:
+    """Calibrate a window; without two drives for it, return None or, if needed, raise."""
     found = [(each, window_errors(each.rows, each.truth, window)) for each in recordings]
     used = [(each, errors) for each, errors in found if len(errors.anchor)]
     if not _two_drives([each for each, _ in used]):
-        raise _too_short("window", window, recordings)
+        if needed:
+            raise _too_short("window", window, recordings)
+        return None
     groups, errors = [each.group for each, _ in used], [each for _, each in used]
     knots, profile = knots_of(window), profile_of(window, errors, groups)
     # Scores are those of the profile that is stored.

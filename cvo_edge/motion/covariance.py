@@ -46,7 +46,8 @@ _ROUNDS = 25
 _STEP = 0.7
 # Squares are clipped at so many times the predicted variance: outliers decide on no variance.
 _CLIP = 16.0
-_LEAST = 1e-18
+_LEAST = 1e-12
+_RIDGE = 1e-4
 
 
 class Shape(NamedTuple):
@@ -94,7 +95,9 @@ def nees(residuals: Array, covariance: Array) -> Array:
 def fit_shape(scaled: Sequence[Array], groups: Sequence[str]) -> Shape:
     """Return the shape of residuals without bias, divided by their scales, (m, 6) each."""
     spread = np.mean([_clipped(each).T @ _clipped(each) / len(each) for each in scaled], axis=0)
-    matrix = spread + 1e-9 * np.diag(np.diag(spread)) + _LEAST * np.eye(6)
+    # A degree of freedom that never errs, as of a planar robot, still needs a variance.
+    deviation = np.sqrt(np.maximum(np.diag(spread), _LEAST))
+    matrix = spread + _RIDGE * np.diag(deviation**2)
     whole = [nees(each, np.broadcast_to(matrix, (len(each), 6, 6))) for each in scaled]
     q = Scores([each[:, np.newaxis] for each in whole], groups).thresholds("mean", LEVEL)
     return Shape(matrix * float(q[0]) / CHI_SQUARE)
@@ -172,7 +175,8 @@ def fit_factors(recordings: Sequence[Sequence[Sums]], groups: Sequence[str]) -> 
         for each in recordings
     ]
     q = Scores([each[:, np.newaxis] for each in scores], groups)
-    return factors * float(q.thresholds("mean", LEVEL)[0]) / CHI_SQUARE
+    inflated = factors * float(q.thresholds("mean", LEVEL)[0]) / CHI_SQUARE
+    return np.asarray(np.maximum(inflated, _LEAST))
 
 
 def _variance_ratio(sums: Sums, factors: Array) -> Array:

@@ -31,6 +31,8 @@ _CLIP = 6.0
 _LEAST = 0.2
 # Numbers are clipped at so many standard deviations: no extrapolation.
 _RANGE = 3.0
+# Of any scale in a file, whoever wrote it.
+_LARGEST_LOG = 20.0
 
 
 class Normal(NamedTuple):
@@ -97,7 +99,8 @@ def solve_scale(sums: Normal) -> Scale:
 def predict_scale(scale: Scale, numbers: Array) -> Array:
     """Return the scales (n, 8) of motions with numbers (n, k - 1); clips the numbers."""
     inside = np.clip(numbers, scale.lowest, scale.highest)
-    return np.asarray(np.exp(scale.coefficients[0] + inside @ scale.coefficients[1:]))
+    logarithms = scale.coefficients[0] + inside @ scale.coefficients[1:]
+    return np.asarray(np.exp(np.clip(logarithms, -_LARGEST_LOG, _LARGEST_LOG)))
 
 
 def eight(errors: Array) -> Array:

@@ -220,7 +220,7 @@ def _check(file: MotionFile) -> None:
         _check_shape(f"{where}: joint", [spec.joint], (1, 6))
         _check_shape(f"{where}: usual", [spec.usual], (1, 8))
         _check_shape(f"{where}: shape", [spec.shape], (1, 21))
-        if np.linalg.eigvalsh(symmetric(spec.shape))[0] <= 0.0:
+        if not _positive(symmetric(spec.shape)):
             raise CalibrationFileError(f"{where}: shape: expected a positive definite matrix")
         _check_thresholds(where, spec.thresholds, len(COLUMNS))
     quaternion = file.correction.q_xyzw
@@ -235,6 +235,14 @@ def symmetric(triangle: Sequence[float]) -> NDArray[np.float64]:
     matrix = np.zeros((6, 6))
     matrix[np.tril_indices(6)] = triangle
     return np.asarray(matrix + np.tril(matrix, -1).T)
+
+
+def _positive(matrix: NDArray[np.float64]) -> bool:
+    """Whether a matrix is positive definite; units of its rows may differ by orders."""
+    variances = np.diag(matrix)
+    if not (variances > 0.0).all():
+        return False
+    return bool(np.linalg.eigvalsh(matrix / np.sqrt(np.outer(variances, variances)))[0] > 0.0)
 
 
 def _check_name(where: str, name: str) -> None:

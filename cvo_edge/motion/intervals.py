@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.documents import shown
 from cvo_edge.errors import UsageError
 from cvo_edge.motion.covariance import SPANS_S, Shape
 from cvo_edge.motion.drift import Familiar
@@ -25,7 +26,7 @@ from cvo_edge.motion.format import (
 from cvo_edge.motion.horizons import Horizon
 from cvo_edge.motion.trace import Limits, Rows, motion_numbers, scale_numbers
 from cvo_edge.motion.windows import Window, knots_of, radii, window_scores
-from cvo_edge.vocabulary import MOTION_RULES, MotionRule, Scope
+from cvo_edge.vocabulary import MOTION_RULES, SCOPES, MotionRule, Scope
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -106,7 +107,8 @@ class MotionHorizon:
         Rows at which none ends get the median.
         """
         found = self.intervals(rows, Level())
-        scales = np.tile(np.median(found.scale[:, :6], axis=0), (len(rows.part), 1))
+        usual = np.median(found.scale[:, :6], axis=0) if len(found.end) else np.ones(6)
+        scales = np.tile(usual, (len(rows.part), 1))
         scales[found.end] = found.scale[:, :6]
         return scales
 
@@ -212,14 +214,17 @@ class MotionCalibration:
         self, confidence: float = 0.9, rule: MotionRule = "mean", scope: Scope = "marginal"
     ) -> Level:
         """Return a level of the file; raises UsageError for others."""
-        if confidence not in LEVELS:
+        if isinstance(confidence, bool) or confidence not in LEVELS:
             raise UsageError(
                 f"confidence: expected one of {', '.join(f'{c:g}' for c in LEVELS)}, found "
-                f"{confidence:g}"
+                f"{shown(confidence)}"
             )
-        if rule not in MOTION_RULES:
-            raise UsageError(f"rule: expected one of {', '.join(MOTION_RULES)}, found {rule}")
-        return Level(confidence, rule, scope)
+        for name, value, known in (("rule", rule, MOTION_RULES), ("scope", scope, SCOPES)):
+            if value not in known:
+                raise UsageError(
+                    f"{name}: expected one of {', '.join(known)}, found {shown(value)}"
+                )
+        return Level(float(confidence), rule, scope)
 
     def scaled(self, poses: Array) -> Array:
         """Return poses (n, 7) with the correction of the scale."""
@@ -257,15 +262,15 @@ class MotionCalibration:
         if level.rule == "tolerance":
             return (
                 f"with probability {groups / (groups + 1):.2f}, at least {percent} of the motions "
-                f"of the next recording like the {groups} calibrated ones are inside"
+                f"of the next drive like the {groups} calibrated ones are inside"
             )
         if level.rule == "mean":
             return (
-                f"on average over recordings like the {groups} calibrated ones, {percent} of "
-                "motions are inside; a single recording may be far off"
+                f"on average over drives like the {groups} calibrated ones, {percent} of "
+                "motions are inside; a single drive may be far off"
             )
         counted = ", where one that misses more than half counts as half"
         return (
-            f"over new recordings like the {groups} calibrated ones, on average at most {missed} "
+            f"over new drives like the {groups} calibrated ones, on average at most {missed} "
             f"of motions are missed{counted if level.rule == 'capped' else ''}"
         )

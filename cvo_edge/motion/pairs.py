@@ -20,6 +20,8 @@ Integers = NDArray[np.int64]
 _NEAR_NS, _FARTHEST_NS = 20_000_000, 100_000_000
 # With fewer poses than this, a pair says nothing.
 LEAST_POSES = 20
+# Between poses that are further apart, a truth cannot be interpolated.
+_SLOWEST_S = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,14 @@ def pair_of(name: str, group: str, estimate: Poses, truth: Poses) -> Pair:
 
     Raises SourceError if they do not overlap, or hardly.
     """
+    period_s = (
+        1e-9 * float(np.median(np.diff(truth.stamps_ns))) if len(truth.stamps_ns) > 1 else 0.0
+    )
+    if period_s > _SLOWEST_S:
+        raise SourceError(
+            f"{truth.path}: expected a truth with at least {1.0 / _SLOWEST_S:g} poses a second, "
+            f"found one every {period_s:.3g} s; between its poses a path would be cut short"
+        )
     track = Track(truth.stamps_ns, truth.poses)
     pair = Pair(name, group, estimate.stamps_ns, estimate.poses, estimate.columns, track)
     both = np.isfinite(np.concatenate([pair.truth, pair.estimate], axis=1)).all(axis=1)

@@ -28,9 +28,9 @@ class MotionReason(StrEnum):
     STAMP_NOT_LATER = "stamp_not_later"  # invalid: not later than the pose before; it is not used
     TRAJECTORY_STARTED = "trajectory_started"  # degraded: nothing came before
     GAP = "gap"  # degraded: too long after the pose before
-    JUMP = "jump"  # degraded: further from the pose before than the robot can move
+    JUMP = "jump"  # degraded: further or more turned than the robot can move since the pose before
     MOTION_UNFAMILIAR = "motion_unfamiliar"  # degraded: faster or rougher than any calibrated drive
-    RATE_DIFFERS = "rate_differs"  # degraded: not the calibration's rate; horizons in frames lapse
+    RATE_DIFFERS = "rate_differs"  # ok: not the calibration's rate; horizons in frames lapse
 
 
 class _Strict(Struct, frozen=True, forbid_unknown_fields=True):
@@ -231,9 +231,11 @@ def records_of(
     ):
         own = tuple(found.get(end, none) for found, none in zip(motions, nothing, strict=True))
         tube = tuple(each[place] for each in tubes)
+        step = None if steps is None or not frames else _known(steps[place])
         if novelty is not None and novelty > 1.0:
             own, why = without, (MotionReason.MOTION_UNFAMILIAR, *why)
             tube = tuple(SinceAnchor(each.spec.window) for each in calibration.windows)
+            step = None
         known = pose[0] == pose[0]
         yield MotionRecord(
             numbers[end],
@@ -244,7 +246,7 @@ def records_of(
             own,
             tube,
             None if novelty is None else round(novelty, 4),
-            UNSET if steps is None else _known(steps[place]),
+            UNSET if steps is None else step,
         )
 
 

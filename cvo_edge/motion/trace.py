@@ -75,7 +75,7 @@ def first_row(stamp_ns: int, pose: Array, columns: Array) -> Rows:
     """Return the first row of a trace: pose (7,), columns (c,)."""
     return Rows(
         np.array([stamp_ns], np.int64),
-        pose[np.newaxis],
+        _usable(pose[np.newaxis], columns[np.newaxis]),
         np.zeros(1, np.int64),
         np.zeros(1),
         np.zeros((1, 6)),
@@ -91,6 +91,7 @@ def next_rows(
 
     ``last`` is the row before; of more rows, the last one counts.
     """
+    poses = _usable(poses, columns)
     stamps = np.concatenate([last.stamps_ns[-1:], stamps_ns])
     every = np.concatenate([last.poses[-1:], poses])
     seconds = 1e-9 * np.diff(stamps)
@@ -139,6 +140,12 @@ def rows_of(stamps_ns: Integers, poses: Array, columns: Array, limits: Limits) -
     return Rows(*(np.concatenate(both) for both in zip(first, rest, strict=True)))
 
 
+def _usable(poses: Array, columns: Array) -> Array:
+    """Return poses (m, 7), NaN where a column (m, c) is not a number."""
+    fine = np.asarray(np.isfinite(columns).all(axis=1))
+    return np.asarray(np.where(fine[:, np.newaxis], poses, np.nan))
+
+
 def _summed(start: Array, values: Array) -> Array:
     """Return running sums in the order of single additions."""
     return np.asarray(np.cumsum(np.concatenate([start, values]), axis=0)[1:])
@@ -151,7 +158,9 @@ def _sizes(twists: Array) -> tuple[Array, Array]:
 
 
 def _logarithms(columns: Array) -> Array:
-    return np.asarray(np.log(np.maximum(columns, 1e-12)))
+    # Of a pose that is missing, which is a break, any number does.
+    finite = np.where(np.isfinite(columns), columns, 1.0)
+    return np.asarray(np.log(np.maximum(finite, 1e-12)))
 
 
 def motion_numbers(rows: Rows, start: Integers, end: Integers) -> tuple[Array, Array]:

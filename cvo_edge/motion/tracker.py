@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from operator import index
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge import geometry
+from cvo_edge.documents import shown
 from cvo_edge.errors import UsageError
 from cvo_edge.estimate import Status
 from cvo_edge.motion.adaptation import MotionAdaptation
@@ -27,6 +29,7 @@ from cvo_edge.motion.records import (
 from cvo_edge.motion.relative import motion, residual
 from cvo_edge.motion.trace import Rows, cut, first_row, next_rows, rows_of
 from cvo_edge.pose import Pose
+from cvo_edge.trajectories.poses import quaternion_pose
 from cvo_edge.vocabulary import MotionCovariance, MotionRule, Scope
 
 Array = NDArray[np.float64]
@@ -38,6 +41,7 @@ KEPT = 1 << 16
 _FIRST = 256
 # The rate is the median of so many steps.
 _RATE_OF = 15
+_LAST_NS = 2**63 - 1
 
 
 def annotate(
@@ -68,10 +72,10 @@ def annotate(
     calibration does not have the covariance.
     """
     values = np.empty((len(stamps_ns), len(calibration.file.columns)))
-    for index, name in enumerate(calibration.file.columns):
+    for place, name in enumerate(calibration.file.columns):
         if name not in columns:
             raise UsageError(f"columns: expected {name}, found {', '.join(columns) or 'none'}")
-        values[:, index] = columns[name]
+        values[:, place] = columns[name]
     rows = rows_of(stamps_ns, calibration.scaled(poses), values, calibration.limits)
     steps = 1e-9 * np.diff(stamps_ns)
     differs = len(steps) > 0 and not calibration.same_rate(float(np.median(steps)))
@@ -129,15 +133,15 @@ def _reasons(
     late: Mask = (seconds > calibration.limits.gap_s) | np.concatenate([[False], missing[:-1]])
     always = (MotionReason.RATE_DIFFERS,) if differs else ()
     found: list[tuple[MotionReason, ...]] = []
-    for index in range(first - before, len(rows.part)):
-        if missing[index]:
+    for place in range(first - before, len(rows.part)):
+        if missing[place]:
             found.append((MotionReason.POSE_MISSING,))
-        elif not broken[index]:
+        elif not broken[place]:
             found.append(always)
-        elif before + index == 0:
+        elif before + place == 0:
             found.append((MotionReason.TRAJECTORY_STARTED, *always))
         else:
-            found.append((MotionReason.GAP if late[index] else MotionReason.JUMP, *always))
+            found.append((MotionReason.GAP if late[place] else MotionReason.JUMP, *always))
     return found
 
 
@@ -188,7 +192,16 @@ class MotionTracker:
         adapt: bool = False,
     ) -> None:
         if not isinstance(calibration, MotionCalibration):
+            if not isinstance(calibration, str | os.PathLike):
+                raise UsageError(
+                    "calibration: expected a MotionCalibration or a path, found "
+                    f"{shown(calibration)}"
+                )
             calibration = MotionCalibration.load(os.fspath(calibration))
+        if covariance not in (None, *get_args(MotionCovariance)):
+            raise UsageError(
+                f"covariance: expected interval or integrated, found {shown(covariance)}"
+            )
         self.calibration = calibration
         self.level = calibration.level(confidence, rule, scope)
         self._covariance = covariance
@@ -214,7 +227,7 @@ class MotionTracker:
         rows = self._kept.rows
         if rows is None:
             raise UsageError("anchor: expected a pose, found none so far")
-        self._anchor_seq = self._kept.numbers[row_at(rows, stamp_ns)]
+        self._anchor_seq = self._kept.numbers[row_at(rows, _nanoseconds(stamp_ns))]
 
     def observe(self, stamp_ns: int, pose: Pose | ArrayLike) -> MotionUpdate:
         """Take the true pose of the body at the stamp of an earlier pose, as late as it comes.
@@ -228,9 +241,14 @@ class MotionTracker:
         rows = self._kept.rows
         if rows is None:
             raise UsageError("observe: expected a pose, found none so far")
-        end = row_at(rows, stamp_ns)
+        end = row_at(rows, _nanoseconds(stamp_ns))
         seq = self._kept.numbers[end]
-        self._truths[seq] = _seven(pose)
+        if seq in self._truths:
+            raise UsageError(f"observe: expected each stamp once, found {stamp_ns} again")
+        truth = _seven(pose)
+        if not np.isfinite(truth).all():
+            raise UsageError(f"observe: expected a true pose, found {shown(pose)}")
+        self._truths[seq] = truth
         if len(self._truths) > KEPT:
             del self._truths[next(iter(self._truths))]
         covered = []
@@ -273,16 +291,22 @@ class MotionTracker:
         Parameters
         ----------
         stamp_ns
-            Time in integer nanoseconds, later than that of the pose before.
+            Time in integer nanoseconds, later than that of the pose before. One that goes back by
+            more than the calibration's gap begins a new trajectory: a clock was set.
         pose
             ``T_world_body``, shape (7,); None if the estimator is lost.
         columns
             Values of the columns that the calibration names.
 
-        Raises UsageError if a column is missing or the pose is malformed. A pose with NaN counts as
-        none; a stamp that is not later gives an ``invalid`` record and changes nothing.
+        Raises UsageError if a column is missing or the pose is malformed, which changes nothing. A
+        pose or column that is not finite counts as none; a stamp that is hardly earlier, or the
+        same, gives an ``invalid`` record and changes nothing.
         """
+        stamp_ns = _nanoseconds(stamp_ns)
+        whole = self.calibration.scaled(_seven(pose)[np.newaxis])
+        given = self._given(columns, lost=not np.isfinite(whole).all())
         seq, self._seq = self._seq, self._seq + 1
+        self._restart_before(stamp_ns)
         rows = self._kept.rows
         if rows is not None and stamp_ns <= rows.stamps_ns[-1]:
             return MotionRecord(
@@ -295,21 +319,34 @@ class MotionTracker:
                 tuple(SinceAnchor(each.spec.window) for each in self.calibration.windows),
                 None,
             )
-        given = np.array(
-            [(columns or {}).get(name, np.nan) for name in self.calibration.file.columns]
-        )
-        if np.isnan(given).any():
-            raise UsageError(
-                f"columns: expected {', '.join(self.calibration.file.columns)}, found "
-                f"{', '.join(columns or ()) or 'none'}"
-            )
-        whole = self.calibration.scaled(_seven(pose)[np.newaxis])
         if rows is None:
             row = first_row(stamp_ns, whole[0], given)
         else:
             stamp = np.array([stamp_ns], np.int64)
             row = next_rows(rows, stamp, whole, given[np.newaxis], self.calibration.limits)
         return self._record(self._kept.add(seq, row))
+
+    def _given(self, columns: Mapping[str, float] | None, *, lost: bool) -> Array:
+        """Return the values of the calibration's columns; a lost estimator needs none."""
+        names = self.calibration.file.columns
+        if lost and columns is None:
+            return np.ones(len(names))
+        try:
+            return np.array([float((columns or {})[name]) for name in names])
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise UsageError(
+                f"columns: expected numbers for {', '.join(names)}, found {shown(columns)}"
+            ) from None
+
+    def _restart_before(self, stamp_ns: int) -> None:
+        """Forget what came before if a stamp goes far back: a clock was set, or one was wrong."""
+        rows = self._kept.rows
+        if rows is None:
+            return
+        if 1e-9 * float(rows.stamps_ns[-1] - stamp_ns) > self.calibration.limits.gap_s:
+            self._kept = _Kept()
+            self._truths = {}
+            self._running = Running(self.calibration.limits.period_s)
 
     def _record(self, rows: Rows) -> MotionRecord:
         end = np.array([len(rows.part) - 1])
@@ -367,15 +404,35 @@ class _Kept:
 
 
 def _seven(pose: Pose | ArrayLike | None) -> Array:
+    """Return a pose (7,), NaN if it is none; raises UsageError for what is not seven numbers.
+
+    Numbers that are no pose of a robot (not finite, no quaternion, beyond 1e9 m) count as none.
+    """
     if pose is None:
         return np.full(7, np.nan)
-    values = pose.to_array() if isinstance(pose, Pose) else np.asarray(pose, np.float64)
+    try:
+        values = pose.to_array() if isinstance(pose, Pose) else np.asarray(pose)
+        if values.dtype.kind not in "fiu":
+            raise TypeError
+        values = values.astype(np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
     if values.shape != (7,):
-        raise UsageError(
-            f"pose: expected 7 numbers tx ty tz qx qy qz qw, found shape {values.shape}"
-        )
-    if np.isfinite(values).all() and not values[3:].any():
-        raise UsageError("pose: expected a quaternion, found zeros")
-    if not np.isfinite(values).all():
-        return np.full(7, np.nan)
-    return np.concatenate([values[:3], geometry.quaternion_normalise(values[3:])])
+        raise UsageError(f"pose: expected 7 numbers tx ty tz qx qy qz qw, found {shown(pose)}")
+    with np.errstate(all="ignore"):
+        q = geometry.quaternion_normalise(values[3:])
+        found = quaternion_pose(values[:3], q)
+    return np.full(7, np.nan) if found is None else found
+
+
+def _nanoseconds(stamp_ns: int) -> int:
+    """Return a stamp; raises UsageError for anything but an integer of 63 bits."""
+    try:
+        if isinstance(stamp_ns, bool):
+            raise TypeError
+        stamp = index(stamp_ns)
+    except TypeError:
+        raise UsageError(f"stamp: expected integer nanoseconds, found {shown(stamp_ns)}") from None
+    if not -_LAST_NS < stamp < _LAST_NS:
+        raise UsageError(f"stamp: expected nanoseconds of 63 bits, found {stamp}")
+    return stamp

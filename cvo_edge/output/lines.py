@@ -97,7 +97,7 @@ class LineFile:
                 reader.register(self._descriptor, select.POLLOUT)
                 reader.poll()
             except OSError as error:
-                self._take_back(written)
+                self._take_back(written - (line[:written].rfind(b"\n") + 1))
                 raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
 
     def _take_back(self, written: int) -> None:

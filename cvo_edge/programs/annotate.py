@@ -20,7 +20,9 @@ from cvo_edge.motion.records import MotionRecord, motion_header
 from cvo_edge.motion.tracker import MotionTracker, annotate
 from cvo_edge.output.lines import LineFile
 from cvo_edge.output.sinks import tum_line
+from cvo_edge.process import say
 from cvo_edge.trajectories.tables import read_rows, seconds_to_ns
+from cvo_edge.trajectories.trajectory import NONE_SKIPPED
 from cvo_edge.trajectories.tum import FORM
 from cvo_edge.vocabulary import MotionCovariance, MotionFormat
 
@@ -49,6 +51,8 @@ def annotate_file(
         calibration, level, poses.stamps_ns, poses.poses, poses.columns, known, covariance
     )
     _write(calibration, level, records, output, written_as, _AT_ONCE)
+    if poses.skipped != NONE_SKIPPED:
+        say(f"{poses.path}: {poses.skipped}")
 
 
 def annotate_stream(
@@ -81,6 +85,8 @@ def format_of(path: str, format: MotionFormat | None) -> MotionFormat:
 
 def _lines() -> Iterator[tuple[int, list[float]]]:
     """Yield stamp and pose of each line of standard input."""
+    if sys.stdin is None:
+        raise SourceError("standard input: expected lines of poses, found it closed")
     for number, line in enumerate(sys.stdin.buffer, start=1):
         words = line.decode("utf-8", "replace").split()
         if not words or words[0].startswith("#"):
@@ -88,10 +94,12 @@ def _lines() -> Iterator[tuple[int, list[float]]]:
         try:
             stamp_ns, pose = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
         except ValueError:
-            pose = []
-        if len(pose) != len(FORM.split()) - 1:
+            stamp_ns, pose = 0, []
+        if len(pose) != len(FORM.split()) - 1 or abs(stamp_ns) >= 2**63 - 1:
             found = " ".join(words)[:_SHOWN]
-            raise SourceError(f"standard input: expected {FORM}, found {found!r} in line {number}")
+            raise SourceError(
+                f"standard input: expected {FORM} in seconds, found {found!r} in line {number}"
+            )
         yield stamp_ns, pose
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cvo_edge.errors import GateError, UsageError
-from cvo_edge.files import refuse_overwriting, write_text, write_whole
+from cvo_edge.files import refuse_overwriting, write_text
 from cvo_edge.programs.options import INTERVALS, REPORT, JsonFileOption
 from cvo_edge.vocabulary import MotionCovariance, MotionFormat, MotionRule, Scope, TrajectoryFormat
 
@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from cvo_edge.motion.horizons import Horizon
 
 _INPUT = "Input"
+# More would not fit into a file of 64 KiB.
+MOST_HORIZONS = 12
+# Of the name in motion.json.
+MOST_LETTERS = 200
 
 FilesArgument = Annotated[
     list[Path] | None,
@@ -100,10 +104,11 @@ ScopeOption = Annotated[
 def conformalize(
     files: FilesArgument = None,
     output: Annotated[
-        Path,
-        typer.Option("-o", "--output", help="File to write.", readable=False),
-    ] = Path("motion.json"),
-    name: Annotated[str, typer.Option(help="Estimator and vehicle, to be told by.")] = "estimator",
+        str, typer.Option("-o", "--output", help="File to write, or - for stdout.")
+    ] = "motion.json",
+    name: Annotated[
+        str, typer.Option(help="Estimator and vehicle, shown in reports.")
+    ] = "estimator",
     pairs: PairsOption = None,
     group: Annotated[
         list[str] | None,
@@ -158,12 +163,18 @@ def conformalize(
     wanted = wanted_corrections(correct)
     horizons = _horizons("--horizon", horizon)
     windows = [] if window == "none" else _horizons("--window", window)
+    columns = _columns(scale)
+    if not output:
+        raise UsageError("--output: expected a file or -, found nothing")
+    if not 0 < len(name) <= MOST_LETTERS or not name.isprintable():
+        raise UsageError(
+            f"--name: expected 1 to {MOST_LETTERS} printable characters, found {name[:80]!r}"
+        )
     given = listed_files(files or [], pairs, group or [])
     read = [path for each in given for path in (each.estimate, each.truth, each.times) if path]
-    refuse_overwriting(str(output), *read, pairs, times)
+    refuse_overwriting(output, *read, pairs, times)
     found = read_pairs(given, Reading(format, times, fps))
     fitted = fits(found)
-    print(*fit_lines(found, fitted, wanted), sep="\n")
     corrected, correction = correct_pairs(found, fitted, wanted)
     file = learn(
         corrected,
@@ -171,13 +182,28 @@ def conformalize(
         horizons,
         windows,
         learned=scale != "none",
-        columns=[] if scale in ("auto", "none") else scale.split(","),
+        columns=columns,
         correction=correction,
     )
     content = encode_motion_file(file)
-    write_whole(output, content)
-    print(*calibration_lines(file), sep="\n")
-    print(f"-> {output}, {len(content)} bytes")
+    # Before the report: whoever reads that may close the pipe.
+    write_text(output, content.decode())
+    if output != "-":
+        print(*fit_lines(found, fitted, wanted), sep="\n")
+        print(*calibration_lines(file), sep="\n")
+        print(f"-> {output}, {len(content)} bytes")
+
+
+def _columns(scale: str) -> list[str]:
+    """Return the columns of --scale; raises UsageError."""
+    if scale in ("auto", "none"):
+        return []
+    columns = scale.split(",")
+    if not all(columns) or len(set(columns)) < len(columns) or {"auto", "none"} & set(columns):
+        raise UsageError(
+            f"--scale: expected auto, none or names of columns, each once, found {scale!r}"
+        )
+    return columns
 
 
 def _horizons(option: str, text: str | None) -> list[Horizon] | None:
@@ -185,9 +211,14 @@ def _horizons(option: str, text: str | None) -> list[Horizon] | None:
 
     if text is None:
         return None
-    found = [Horizon.parse(each) for each in text.split(",")]
-    if len(set(found)) < len(found):
-        raise UsageError(f"{option}: expected each once, found {text}")
+    try:
+        found = [Horizon.parse(each) for each in text.split(",")]
+    except UsageError as error:
+        raise UsageError(f"{option}: {error}") from None
+    if len(set(map(str, found))) < len(found) or len(found) > MOST_HORIZONS:
+        raise UsageError(
+            f"{option}: expected at most {MOST_HORIZONS}, each once, found {text[:80]}"
+        )
     return found
 
 
@@ -246,6 +277,8 @@ def annotate(
     calibration = MotionCalibration.load(motion)
     level = calibration.level(confidence, rule, scope)
     written_as = format_of(output, format)
+    if covariance is not None and written_as != "jsonl":
+        raise UsageError(f"--covariance: expected the format jsonl, found {written_as}")
     if estimate == "-":
         if anchors is not None:
             raise UsageError("--anchors: expected a file of poses, found standard input")
@@ -280,7 +313,7 @@ def audit(
         Path | None,
         typer.Option(
             help="PNG file: the first recording from above with its tubes, errors and radii by "
-            "horizon, coverage by recording (extra [plot]).",
+            "horizon, coverage by recording (extra \\[plot]).",
             readable=False,
             show_default=False,
             rich_help_panel=REPORT,
@@ -314,6 +347,8 @@ def audit(
         raise UsageError("--correct: expected time or frame, found scale, which motion.json holds")
     calibration = MotionCalibration.load(motion)
     level = calibration.level(confidence, rule, scope)
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise UsageError(f"--picture: expected a file .png, found {picture}")
     named = listed_files(given, pairs, [])
     read = [path for each in named for path in (each.estimate, each.truth, each.times) if path]
     for written in (json_file, picture):
@@ -323,20 +358,21 @@ def audit(
     if wanted:
         found, _ = correct_pairs(found, fits(found), wanted)
     report = compare(calibration, level, found)
-    if json_file is not None:
-        write_text(json_file, json.dumps(msgspec.to_builtins(report), indent=1) + "\n")
+    failure = None
+    if min_coverage is not None:
+        failure = report.failure(min_coverage)
     if picture is not None:
         from cvo_edge.programs.motion_picture import draw_audit
 
         draw_audit(picture, calibration, level, found, report)
-    if json_file != "-":
-        print(*audit_lines(report), sep="\n")
-    if min_coverage is None:
-        return
-    for spec in calibration.file.horizons:
-        coverage = report.coverage(spec.horizon)
-        if coverage is not None and coverage < min_coverage:
-            raise GateError(
-                f"audit: expected a coverage of at least {min_coverage:g} at every horizon, found "
-                f"{coverage:.3f} at {spec.horizon}"
-            )
+    if json_file is not None:
+        write_text(json_file, json.dumps(msgspec.to_builtins(report), indent=1) + "\n")
+    try:
+        if json_file != "-":
+            print(*audit_lines(report), sep="\n", flush=True)
+    except BrokenPipeError:
+        # Whoever closed the pipe still wants to know whether the gate failed.
+        if failure is None:
+            raise
+    if failure is not None:
+        raise GateError(f"audit: {failure}")

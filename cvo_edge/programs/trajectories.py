@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from itertools import takewhile
@@ -12,7 +13,7 @@ import numpy as np
 
 from cvo_edge import geometry
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.motion.alignment import LEAST_MOTIONS
+from cvo_edge.motion.alignment import LEAST_MOTIONS, MOST_OFFSET_S, Alignment
 from cvo_edge.motion.corrections import Fit, corrected, fit_of
 from cvo_edge.motion.files import Poses, read_poses
 from cvo_edge.motion.format import CorrectionSpec
@@ -21,7 +22,9 @@ from cvo_edge.trajectories.tables import read_text
 from cvo_edge.vocabulary import MOTION_CORRECTIONS, MotionCorrection, TrajectoryFormat
 
 # Scales of recordings of one estimator may differ by this factor.
-_MOST_SPREAD = 1.1
+MOST_SPREAD = 1.1
+# Of motions, what is left over in files that are the same, and in files of different drives.
+_SAME, _OTHER = 1e-3, 0.5
 _FORM = "estimate truth [group [times]]"
 
 
@@ -43,6 +46,8 @@ class Reading(NamedTuple):
 
     def poses(self, path: Path, times: Path | None = None) -> Poses:
         """Read a file; raises SourceError and UsageError."""
+        if self.fps is not None and not math.isfinite(self.fps):
+            raise UsageError(f"--fps: expected a number, found {self.fps}")
         return read_poses(path, self.format).stamped(times or self.times, self.fps)
 
 
@@ -89,10 +94,10 @@ def read_pairs(files: Sequence[Files], reading: Reading) -> list[Pair]:
     """
     truths: dict[tuple[Path, Path | None], Poses] = {}
     names = _names([each.estimate for each in files])
-    drives = _names([each.truth for each in files])
+    drives = _names([each.truth.resolve() for each in files])
     pairs = []
     for each, name, drive in zip(files, names, drives, strict=True):
-        key = (each.truth, each.times)
+        key = (each.truth.resolve(), each.times)
         if key not in truths:
             truths[key] = reading.poses(each.truth, each.times)
         estimate = reading.poses(each.estimate, each.times)
@@ -126,6 +131,7 @@ def fits(pairs: Sequence[Pair]) -> list[Fit]:
                 f"{pair.name}: expected at least {LEAST_MOTIONS} motions with a truth, found "
                 "fewer, or none that moves"
             )
+        _check_fit(pair, alignment)
         fit = fit_of(pair, alignment)
         if fit.unit is not None:
             raise SourceError(
@@ -134,6 +140,27 @@ def fits(pairs: Sequence[Pair]) -> list[Fit]:
             )
         found.append(fit)
     return found
+
+
+def _check_fit(pair: Pair, alignment: Alignment) -> None:
+    """Raise SourceError for two files that are not of one drive, or are one and the same."""
+    rotation, translation = alignment.misfit.tolist()
+    if max(rotation, translation) < _SAME:
+        raise SourceError(
+            f"{pair.name}: expected an estimate with its truth, found the same motions in both"
+        )
+    if min(rotation, translation) > _OTHER or alignment.scale <= 0.0:
+        raise SourceError(
+            f"{pair.name}: expected two trajectories of one drive, found motions that do not fit: "
+            f"{min(rotation, 9.99):.0%} of rotations and {min(translation, 9.99):.0%} of "
+            "translations are left over; check the pair, stamps and the quaternions' order "
+            "(qx qy qz qw)"
+        )
+    if abs(alignment.offset_s) >= MOST_OFFSET_S:
+        raise SourceError(
+            f"{pair.name}: expected stamps that differ by less than {MOST_OFFSET_S:g} s, found "
+            f"{alignment.offset_s:.3f} s"
+        )
 
 
 def wanted_corrections(text: str | None) -> tuple[MotionCorrection, ...]:
@@ -159,7 +186,7 @@ def correct_pairs(
     scale = None
     if "scale" in wanted:
         scales = [each.scale for each in alignments]
-        if max(scales) > _MOST_SPREAD * min(scales):
+        if max(scales) > MOST_SPREAD * min(scales):
             raise UsageError(
                 f"--correct scale: expected one scale of all recordings, found {min(scales):.3f} "
                 f".. {max(scales):.3f}; leave it out, or scale each file"

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 Key = TypeVar("Key", int, str)
 
 LISTED_TWICE = "listed twice"
+NONE_SKIPPED = "none skipped"
 
 
 class Skipped(dict[str, int]):
@@ -35,7 +36,7 @@ class Skipped(dict[str, int]):
     def __str__(self) -> str:
         """Return e.g. ``skipped 3: invalid pose 3 (first in truth.txt, line 7: ...)``."""
         if not self:
-            return "none skipped"
+            return NONE_SKIPPED
         first = {reason: f" (first in {where})" for reason, where in self.first.items()}
         reasons = ", ".join(
             f"{reason} {count}{first.get(reason, '')}" for reason, count in self.items()

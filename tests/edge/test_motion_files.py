@@ -261,9 +261,70 @@ def test_another_rate_ends_horizons_in_frames(calibration: MotionCalibration) ->
 
 def test_wrong_poses_are_refused(calibration: MotionCalibration) -> None:
     tracker = MotionTracker(calibration)
-    for pose in ([0.0] * 6, [0.0] * 7):
-        with pytest.raises(UsageError, match=r"^pose: expected"):
+    wrong = ([0.0] * 6, "pose", {}, [True] * 7, [1j] * 7, [[0.0] * 7])
+    for pose in wrong:
+        with pytest.raises(UsageError, match=r"^pose: expected 7 numbers"):
             tracker.step(0, pose)
+    for stamp in (0.5, None, True, 2**63, "5", float("nan")):
+        with pytest.raises(UsageError, match=r"^stamp: expected"):
+            tracker.step(stamp, None)
+    # What an estimator that is lost may send, and no number of it was used up above.
+    for seq, lost in enumerate((None, [0.0] * 7, [np.nan] * 7, [1e200] * 3 + [0, 0, 0, 1])):
+        record = tracker.step(seq + 1, lost)
+        assert (record.seq, record.status) == (seq, Status.INVALID)
+        assert record.reasons == (MotionReason.POSE_MISSING,)
+    for level in ({"confidence": 0.7}, {"rule": "best"}, {"scope": "all"}, {"covariance": "full"}):
+        with pytest.raises(UsageError, match=r": expected "):
+            MotionTracker(calibration, **level)
+
+
+def test_a_clock_that_is_set_back_begins_anew(calibration: MotionCalibration) -> None:
+    pair = drive(1, 60)
+    tracker = MotionTracker(calibration)
+    tracker.step(9 * 10**18, pair.estimate[0])
+    records = [
+        tracker.step(int(stamp), pose)
+        for stamp, pose in zip(pair.stamps_ns, pair.estimate, strict=True)
+    ]
+    assert records[0].reasons == (MotionReason.TRAJECTORY_STARTED,)
+    assert all(record.motion[0].bounded for record in records[1:])
+
+
+def test_a_planar_robot_that_stands_at_times_is_calibrated() -> None:
+    pairs = []
+    for seed in range(3):
+        pair = drive(200 + seed, 300)
+        for poses in (pair.estimate, pair.track.poses):
+            poses[:, 2] = poses[:, 3] = poses[:, 4] = 0.0
+            poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+            poses[100:120] = poses[100]
+        pairs.append(pair)
+    file = conformalize(pairs, "wheels", HORIZONS, WINDOWS)
+    assert decode_motion_file(encode_motion_file(file)).horizons[0].horizon == "1f"
+    report = audit(MotionCalibration(file), MotionCalibration(file).level(), pairs)
+    assert report.calibrated_on == tuple(pair.name for pair in pairs)
+    assert all(np.isfinite(each.nees) for one in report.recordings for each in one.horizons)
+
+
+def test_a_column_that_is_no_number_is_a_pose_that_is_missing() -> None:
+    pairs = [drive(210 + seed, 200) for seed in range(3)]
+    for pair in pairs:
+        pair.columns["inliers"] = np.random.default_rng(0).uniform(20.0, 80.0, 201)
+    calibration = MotionCalibration(
+        conformalize(pairs, "test", HORIZONS[:2], [], columns=["inliers"])
+    )
+    values = pairs[0].columns["inliers"].copy()
+    values[[50, 90]] = np.nan, np.inf
+    level = calibration.level()
+    given = pairs[0].stamps_ns, pairs[0].estimate, {"inliers": values}
+    records = list(annotate(calibration, level, *given))
+    lost = [record.seq for record in records if MotionReason.POSE_MISSING in record.reasons]
+    assert lost == [50, 90]
+    assert records[-1].motion[1].bounded
+    tracker = MotionTracker(calibration)
+    for columns in (None, {}, {"inliers": "many"}, 5):
+        with pytest.raises(UsageError, match=r"^columns: expected numbers for inliers"):
+            tracker.step(0, pairs[0].estimate[0], columns)
     assert tracker.step(1, None).status == Status.INVALID
 
 
@@ -338,7 +399,7 @@ def test_every_format_has_every_pose(tmp_path: Path, file: MotionFile) -> None:
     motion.write_bytes(encode_motion_file(file))
     estimate, _ = written(pair, tmp_path)
     rows = tmp_path / "a.csv"
-    assert run("annotate", estimate, motion, "-o", rows, "--covariance", "interval")[0] == 0
+    assert run("annotate", estimate, motion, "-o", rows)[0] == 0
     lines = [line for line in rows.read_text().splitlines() if not line.startswith("#")]
     assert len(lines) == 1 + 61 * len(HORIZONS)
     assert {len(line.split(",")) for line in lines} == {len(lines[0].split(","))}
@@ -401,6 +462,13 @@ def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -
         (["conformalize", *one, *other, *output, "--window", "1000s"], 2, "window 1000s"),
         (["conformalize", *one, *other, *output, "--scale", "inliers"], 2, "column inliers"),
         (["conformalize", *one, *other, "-o", one[0]], 2, "among the inputs"),
+        (["conformalize", *one, *other, "-o", ""], 2, "--output: expected"),
+        (["conformalize", *one, *other, *output, "--name", ""], 2, "--name: expected"),
+        (["conformalize", *one, *other, *output, "--scale", "auto,x"], 2, "--scale: expected"),
+        (["conformalize", one[0], other[1], *other, *output], 6, "that do not fit"),
+        (["conformalize", one[1], one[1], *other, *output], 6, "the same motions in both"),
+        (["audit", *one, motion, "--picture", "a.jpg"], 2, "--picture: expected"),
+        (["annotate", one[0], motion, "-o", "a.csv", "--covariance", "interval"], 2, "jsonl"),
         (["audit", *one, tmp_path / "corrupt.json"], 3, "corrupt.json"),
         (["audit", *one, tmp_path / "none.json"], 3, "no such file"),
         (["annotate", one[0], motion, "--confidence", "0.7"], 2, "confidence: expected"),
