@@ -71,7 +71,7 @@ def conformalize(
     name
         Estimator and vehicle.
     horizons, windows
-        What to calibrate; None: those of the defaults that the recordings are long enough for.
+        What to calibrate; None: those of the defaults that half of the drives are long enough for.
     learned
         Whether bias and scale are learned, where they pay; else scores are plain errors.
     columns
@@ -142,8 +142,10 @@ class _Recording(NamedTuple):
     truth: Array
 
 
-def _two_drives(recordings: Sequence[_Recording]) -> bool:
-    return len({each.group for each in recordings}) > 1
+def _enough(used: Sequence[_Recording], recordings: Sequence[_Recording], *, needed: bool) -> bool:
+    """Whether two drives are long enough for a horizon and, unless it is needed, half of all."""
+    own, every = ({each.group for each in some} for some in (used, recordings))
+    return len(own) > 1 and (needed or 2 * len(own) >= len(every))
 
 
 def _too_short(what: str, horizon: Horizon, recordings: Sequence[_Recording]) -> UsageError:
@@ -201,10 +203,10 @@ def trace_of(pair: Pair, limits: Limits, columns: Sequence[str]) -> Rows:
 def _horizon(
     horizon: Horizon, recordings: Sequence[_Recording], learned: bool, *, needed: bool
 ) -> HorizonSpec | None:
-    """Calibrate a horizon; without two drives for it, return None or, if needed, raise."""
+    """Calibrate a horizon; without enough drives for it, return None or, if needed, raise."""
     found = [errors_of(each.rows, each.truth, horizon) for each in recordings]
     used = [index for index, each in enumerate(found) if len(each.end) >= _LEAST_MOTIONS]
-    if not _two_drives([recordings[index] for index in used]):
+    if not _enough([recordings[index] for index in used], recordings, needed=needed):
         if needed:
             raise _too_short("horizon", horizon, recordings)
         return None
@@ -278,10 +280,10 @@ def _integrated(
 def _window(
     window: Horizon, recordings: Sequence[_Recording], *, needed: bool
 ) -> WindowSpec | None:
-    """Calibrate a window; without two drives for it, return None or, if needed, raise."""
+    """Calibrate a window; without enough drives for it, return None or, if needed, raise."""
     found = [(each, window_errors(each.rows, each.truth, window)) for each in recordings]
     used = [(each, errors) for each, errors in found if len(errors.anchor)]
-    if not _two_drives([each for each, _ in used]):
+    if not _enough([each for each, _ in used], recordings, needed=needed):
         if needed:
             raise _too_short("window", window, recordings)
         return None

@@ -125,15 +125,15 @@ def conformalize(
         str | None,
         typer.Option(
             help="Frames (f), seconds (s) or metres (m) back, with commas; default: those of "
-            "1f,1s,5s,10m,100m that the drives are long enough for.",
+            "1f,1s,5s,10m,100m that half of the drives are long enough for.",
             show_default=False,
         ),
     ] = None,
     window: Annotated[
         str | None,
         typer.Option(
-            help="Windows of tubes, with commas, or none; default: those of 10s,100m that the "
-            "drives are long enough for.",
+            help="Windows of tubes, with commas, or none; default: those of 10s,100m that "
+            "half of the drives are long enough for.",
             show_default=False,
         ),
     ] = None,
