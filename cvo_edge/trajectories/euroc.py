@@ -37,7 +37,7 @@ def read_euroc(path: Path, T_body_camera: NDArray[np.float64]) -> Trajectory[int
     Raises SourceError if the file cannot be read, a line is malformed, or no pose is valid.
     """
     rows = read_rows(path, FORM, separator=",", more=True)
-    numbers = np.array([row.numbers(1) for row in rows]).reshape(len(rows), -1)
+    numbers = np.array([row.numbers(1) for row in rows]).reshape(-1, 7)
     poses, faults = quaternion_poses(numbers[:, :3], np.roll(numbers[:, 3:], -1, axis=1))
     if not np.array_equal(T_body_camera, np.eye(4)):
         poses = [camera_pose(pose, T_body_camera) for pose in poses]

@@ -53,7 +53,7 @@ def read_tum_columns(path: Path, form: str) -> tuple[Trajectory[int], Array]:
     """
     rows = read_rows(path, form)
     stamps = [row.seconds() for row in rows]
-    numbers = np.array([row.numbers(1) for row in rows]).reshape(len(rows), -1)
+    numbers = np.array([row.numbers(1) for row in rows]).reshape(-1, len(form.split()) - 1)
     poses, faults = quaternion_poses(numbers[:, :3], numbers[:, 3:7])
     order = sorted(range(len(rows)), key=stamps.__getitem__)
     entries = [Entry(stamps[k], poses[k], rows[k].where, faults[k] or None) for k in order]
