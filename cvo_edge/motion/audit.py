@@ -106,6 +106,11 @@ class Audit(Struct, frozen=True):
     calibrated_on: tuple[str, ...]
     horizons: tuple[str, ...]
 
+    def over(self, horizon: str) -> list[HorizonAudit]:
+        """Return the figures at a horizon, of recordings with motions over it."""
+        every = (each for one in self.recordings for each in one.horizons)
+        return [each for each in every if each.horizon == horizon and each.motions]
+
     def failure(self, least: float) -> str | None:
         """Return why the coverage is not at least this at every horizon, or None."""
         for horizon in self.horizons:
@@ -123,12 +128,8 @@ class Audit(Struct, frozen=True):
 
         That of the degrees of freedom in the marginal scope, that of all six in the joint one.
         """
-        found = [
-            each.joint if self.scope == "joint" else float(np.mean(each.dof))
-            for recording in self.recordings
-            for each in recording.horizons
-            if each.horizon == horizon and each.motions
-        ]
+        joint = self.scope == "joint"
+        found = [each.joint if joint else float(np.mean(each.dof)) for each in self.over(horizon)]
         return float(np.mean(found)) if found else None
 
 

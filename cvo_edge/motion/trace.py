@@ -103,8 +103,9 @@ def next_rows(
     known = (seconds <= limits.gap_s) & (speed <= limits.speed) & (turn <= limits.turn)
     twist[~known] = 0.0
     before = np.concatenate([last.twist[-1:], twist[:-1]])
-    # A twist of exactly zero before a break and one that is not known lead to the same change.
-    moving = np.concatenate([last.twist[-1:].any(axis=1), known[:-1]])
+    # The twist before is zero after a break. One that stands exactly still counts as unknown, too:
+    # a row does not say which it is.
+    moving = before.any(axis=1)
     change = np.where((known & moving)[:, np.newaxis], (twist - before) * limits.period_s, 0.0)
     sizes = [*_sizes(twist), *_sizes(change / limits.period_s)]
     values = np.concatenate([np.stack(sizes, axis=1), _logarithms(columns)], axis=1)

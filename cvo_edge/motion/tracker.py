@@ -5,13 +5,11 @@ from __future__ import annotations
 import os
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
-from operator import index
 from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cvo_edge import geometry
 from cvo_edge.documents import shown
 from cvo_edge.errors import UsageError
 from cvo_edge.estimate import Status
@@ -19,6 +17,7 @@ from cvo_edge.motion.adaptation import MotionAdaptation
 from cvo_edge.motion.drift import Running
 from cvo_edge.motion.fitting import eight
 from cvo_edge.motion.intervals import Level, MotionCalibration, MotionHorizon
+from cvo_edge.motion.kept import KEPT, Kept, nanoseconds, seven
 from cvo_edge.motion.records import (
     MotionInterval,
     MotionReason,
@@ -29,19 +28,14 @@ from cvo_edge.motion.records import (
 from cvo_edge.motion.relative import motion, residual
 from cvo_edge.motion.trace import Rows, cut, first_row, next_rows, rows_of
 from cvo_edge.pose import Pose
-from cvo_edge.trajectories.poses import quaternion_pose
 from cvo_edge.vocabulary import MotionCovariance, MotionRule, Scope
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-# Poses that are kept at most: a horizon of 100 m is long for a robot that stands.
-KEPT = 1 << 16
-_FIRST = 256
 # The rate is the median of so many steps.
 _RATE_OF = 15
-_LAST_NS = 2**63 - 1
 
 
 def annotate(
@@ -164,8 +158,8 @@ class MotionUpdate(NamedTuple):
 class MotionTracker:
     """Intervals on an estimator's motion as its poses come.
 
-    The records are those that ``annotate`` gives for the same poses, but for the rate, which is
-    not known before some poses have come. Not safe for use by several threads.
+    The records are those that ``annotate`` gives for the same poses, up to rounding, but for the
+    rate, which is not known before some poses have come. Not safe for use by several threads.
 
     Parameters
     ----------
@@ -213,7 +207,7 @@ class MotionTracker:
             ]
         self._truths: dict[int, Array] = {}
         self._running = Running(calibration.limits.period_s)
-        self._kept = _Kept()
+        self._kept = Kept()
         self._seq = 0
         # By number, as rows move when old ones are dropped.
         self._anchor_seq = 0
@@ -227,7 +221,7 @@ class MotionTracker:
         rows = self._kept.rows
         if rows is None:
             raise UsageError("anchor: expected a pose, found none so far")
-        self._anchor_seq = self._kept.numbers[row_at(rows, _nanoseconds(stamp_ns))]
+        self._anchor_seq = self._kept.numbers[row_at(rows, nanoseconds(stamp_ns))]
 
     def observe(self, stamp_ns: int, pose: Pose | ArrayLike) -> MotionUpdate:
         """Take the true pose of the body at the stamp of an earlier pose, as late as it comes.
@@ -241,11 +235,11 @@ class MotionTracker:
         rows = self._kept.rows
         if rows is None:
             raise UsageError("observe: expected a pose, found none so far")
-        end = row_at(rows, _nanoseconds(stamp_ns))
+        end = row_at(rows, nanoseconds(stamp_ns))
         seq = self._kept.numbers[end]
         if seq in self._truths:
             raise UsageError(f"observe: expected each stamp once, found {stamp_ns} again")
-        truth = _seven(pose)
+        truth = seven(pose)
         if not np.isfinite(truth).all():
             raise UsageError(f"observe: expected a true pose, found {shown(pose)}")
         self._truths[seq] = truth
@@ -302,8 +296,8 @@ class MotionTracker:
         pose or column that is not finite counts as none; a stamp that is hardly earlier, or the
         same, gives an ``invalid`` record and changes nothing.
         """
-        stamp_ns = _nanoseconds(stamp_ns)
-        whole = self.calibration.scaled(_seven(pose)[np.newaxis])
+        stamp_ns = nanoseconds(stamp_ns)
+        whole = self.calibration.scaled(seven(pose)[np.newaxis])
         given = self._given(columns, lost=not np.isfinite(whole).all())
         seq, self._seq = self._seq, self._seq + 1
         self._restart_before(stamp_ns)
@@ -344,7 +338,7 @@ class MotionTracker:
         if rows is None:
             return
         if 1e-9 * float(rows.stamps_ns[-1] - stamp_ns) > self.calibration.limits.gap_s:
-            self._kept = _Kept()
+            self._kept = Kept()
             self._truths = {}
             self._running = Running(self.calibration.limits.period_s)
 
@@ -371,68 +365,3 @@ class MotionTracker:
             factors=self._factors() if self._adaptations is not None else None,
         )
         return record
-
-
-class _Kept:
-    """The last rows, in arrays that grow."""
-
-    def __init__(self) -> None:
-        self._size = 0
-        self._arrays: Rows | None = None
-        self.numbers: list[int] = []
-
-    @property
-    def rows(self) -> Rows | None:
-        return None if self._arrays is None else cut(self._arrays, slice(0, self._size))
-
-    def add(self, seq: int, row: Rows) -> Rows:
-        """Add a row and return all of them."""
-        if self._arrays is None:
-            self._arrays = cut(row, np.zeros(_FIRST, np.int64))
-        if self._size == len(self._arrays.part):
-            # Rather than growing without end, the older ones are dropped.
-            kept = min(self._size, KEPT)
-            latest = np.arange(self._size - kept, self._size)
-            self._arrays = cut(self._arrays, np.concatenate([latest, latest]))
-            self.numbers = self.numbers[-kept:]
-            self._size = kept
-        for array, values in zip(self._arrays, row, strict=True):
-            array[self._size] = values[0]
-        self.numbers.append(seq)
-        self._size += 1
-        return cut(self._arrays, slice(0, self._size))
-
-
-def _seven(pose: Pose | ArrayLike | None) -> Array:
-    """Return a pose (7,), NaN if it is none; raises UsageError for what is not seven numbers.
-
-    Numbers that are no pose of a robot (not finite, no quaternion, beyond 1e9 m) count as none.
-    """
-    if pose is None:
-        return np.full(7, np.nan)
-    try:
-        values = pose.to_array() if isinstance(pose, Pose) else np.asarray(pose)
-        if values.dtype.kind not in "fiu":
-            raise TypeError
-        values = values.astype(np.float64)
-    except (TypeError, ValueError):
-        values = np.empty(0)
-    if values.shape != (7,):
-        raise UsageError(f"pose: expected 7 numbers tx ty tz qx qy qz qw, found {shown(pose)}")
-    with np.errstate(all="ignore"):
-        q = geometry.quaternion_normalise(values[3:])
-        found = quaternion_pose(values[:3], q)
-    return np.full(7, np.nan) if found is None else found
-
-
-def _nanoseconds(stamp_ns: int) -> int:
-    """Return a stamp; raises UsageError for anything but an integer of 63 bits."""
-    try:
-        if isinstance(stamp_ns, bool):
-            raise TypeError
-        stamp = index(stamp_ns)
-    except TypeError:
-        raise UsageError(f"stamp: expected integer nanoseconds, found {shown(stamp_ns)}") from None
-    if not -_LAST_NS < stamp < _LAST_NS:
-        raise UsageError(f"stamp: expected nanoseconds of 63 bits, found {stamp}")
-    return stamp

@@ -171,7 +171,7 @@ def conformalize(
             f"--name: expected 1 to {MOST_LETTERS} printable characters, found {name[:80]!r}"
         )
     given = listed_files(files or [], pairs, group or [])
-    read = [path for each in given for path in (each.estimate, each.truth, each.times) if path]
+    read = [path for each in given for path in each.paths]
     refuse_overwriting(output, *read, pairs, times)
     found = read_pairs(given, Reading(format, times, fps))
     fitted = fits(found)
@@ -350,7 +350,7 @@ def audit(
     if picture is not None and picture.suffix.lower() != ".png":
         raise UsageError(f"--picture: expected a file .png, found {picture}")
     named = listed_files(given, pairs, [])
-    read = [path for each in named for path in (each.estimate, each.truth, each.times) if path]
+    read = [path for each in named for path in each.paths]
     for written in (json_file, picture):
         if written is not None:
             refuse_overwriting(str(written), *read, motion, pairs, times)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from cvo_edge.errors import printable
-from cvo_edge.motion.audit import Audit
+from cvo_edge.motion.audit import Audit, HorizonAudit, NeesAudit
 from cvo_edge.motion.corrections import Fit
 from cvo_edge.motion.format import MotionFile
 from cvo_edge.motion.intervals import Level, MotionCalibration
@@ -152,15 +152,10 @@ def audit_lines(report: Audit) -> Iterator[str]:
         f"{'horizon':>8}{'recordings':>12}{'each DoF':>10}{'all six':>9}{'position':>10}"
         f"{'rotation':>10}{'least':>7}  mean half-width, radius"
     )
-    for name in dict.fromkeys(each.horizon for r in report.recordings for each in r.horizons):
-        found = [
-            each
-            for recording in report.recordings
-            for each in recording.horizons
-            if each.horizon == name and each.motions
-        ]
+    for name in report.horizons:
+        found = report.over(name)
         if not found:
-            yield f"{name:>8}{0:>12}  no recording is long enough"
+            yield f"{name:>8}{0:>12}  no motion with a truth at both ends"
             continue
         dof = np.array([each.dof for each in found])
         half = np.mean([each.half_widths for each in found], axis=0)
@@ -188,26 +183,15 @@ def audit_lines(report: Audit) -> Iterator[str]:
                 f"{np.mean([each.rotation for each in windows]):.3f}"
             )
     yield "NEES over 6 (1 fits), and share up to chi-square's 0.9 quantile; means over recordings"
-    for name in dict.fromkeys(each.horizon for r in report.recordings for each in r.horizons):
-        found = [
-            each
-            for recording in report.recordings
-            for each in recording.horizons
-            if each.horizon == name and each.motions
-        ]
+    for name in report.horizons:
+        found = report.over(name)
         if found:
-            yield (
-                f"{name:>8}  interval    {np.mean([each.nees for each in found]):6.2f}"
-                f"{np.mean([each.nees_inside for each in found]):8.3f}"
-            )
+            yield _nees_line(f"{name:>8}  interval  ", found)
     for span_s in dict.fromkeys(each.seconds for r in report.recordings for each in r.integrated):
-        sums = [
-            each
-            for recording in report.recordings
-            for each in recording.integrated
-            if each.seconds == span_s
-        ]
-        yield (
-            f"{span_s:>7g}s  integrated  {np.mean([each.nees for each in sums]):6.2f}"
-            f"{np.mean([each.nees_inside for each in sums]):8.3f}"
-        )
+        sums = [x for r in report.recordings for x in r.integrated if x.seconds == span_s]
+        yield _nees_line(f"{span_s:>7g}s  integrated", sums)
+
+
+def _nees_line(what: str, found: Sequence[HorizonAudit] | Sequence[NeesAudit]) -> str:
+    ratio = np.mean([each.nees for each in found])
+    return f"{what}  {ratio:6.2f}{np.mean([each.nees_inside for each in found]):8.3f}"

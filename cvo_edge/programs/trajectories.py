@@ -36,6 +36,11 @@ class Files(NamedTuple):
     group: str | None = None
     times: Path | None = None
 
+    @property
+    def paths(self) -> list[Path]:
+        """All files."""
+        return [path for path in (self.estimate, self.truth, self.times) if path]
+
 
 class Reading(NamedTuple):
     """How files are read: their format, and times for formats without."""
