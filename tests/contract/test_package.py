@@ -126,8 +126,8 @@ def test_the_lowest_constraints_are_the_declared_lower_bounds():
 @pytest.mark.parametrize(
     ("file", "name", "extras"),
     [
-        ("runtime.txt", "cvo-edge", ("openvino", "rosbag", "sign")),
-        ("export.txt", "cvo-export", ("plot", "ray", "rosbag")),
+        ("runtime.txt", "cvo-edge", ("openvino", "ray", "rosbag", "sign")),
+        ("export.txt", "cvo-export", ("plot", "rosbag")),
     ],
 )
 def test_pinned_versions_are_in_the_closure_and_in_the_declared_ranges(file, name, extras):
