@@ -2,7 +2,8 @@
 
 Public pairs of an estimate and a ground truth are often off by a frame or by a degree. Such a fault
 widens all intervals, and it is not the estimator's. With the motions dE of the estimate and dG of
-the truth over half a second, as rotation vectors w and translations t,
+the truth over half a second (of keyframes: from one to the next), as rotation vectors w and
+translations t,
 
     w_G = R w_E,    t_G = s R t_E
 
@@ -37,6 +38,8 @@ MOST_OFFSET_S = 1.0
 # Standard error (deg) from which on a rotation about an axis is undetermined.
 UNDETERMINED_DEG = 0.5
 _SPAN = Horizon("s", 0.5)
+# Motions between keyframes are those of neighbours, up to so many usual periods.
+_WIDEST = 3.0
 _KEPT = 0.8
 _BLOCKS = 10
 _STEPS = 6
@@ -166,7 +169,12 @@ class _Pair:
         stamps_ns, estimate = stamps_ns[whole], estimate[whole]
         along = _SPAN.along(stamps_ns, path_length(estimate))
         every = np.arange(len(along))
-        start = starts(_SPAN, along, np.zeros_like(every), every)
+        usual_s = float(np.median(np.diff(along)))
+        if usual_s <= 0.5 * _SPAN.value:
+            start = starts(_SPAN, along, np.zeros_like(every), every)
+        else:
+            # Keyframes, at odd times: hardly two of them are half a second apart.
+            start = np.where(np.diff(along, prepend=-np.inf) <= _WIDEST * usual_s, every - 1, -1)
         end = np.flatnonzero(start >= 0)
         end = end[:: max(1, len(end) // _MOST_MOTIONS)]
         self._stamps_ns = np.concatenate([stamps_ns[start[end]], stamps_ns[end]])

@@ -28,8 +28,9 @@ HORIZONS = (Horizon("f", 1), Horizon("s", 1))
 _LEVEL = 0.9
 _WORTH = 0.9
 _SIGNIFICANT = 3.0
-# The least corrections: a share of the estimate's period, degrees, and a share of the scale.
-_LEAST_OFFSET, _LEAST_TURN_DEG, _LEAST_SCALE = 0.25, 0.6, 0.01
+# The least corrections: a share of the estimate's period and, of keyframes, seconds; degrees, and a
+# share of the scale.
+_LEAST_OFFSET_S, _LEAST_OFFSET, _LEAST_TURN_DEG, _LEAST_SCALE = 0.02, 0.25, 0.6, 0.01
 # Factors between units: one file in millimetres or centimetres.
 _UNITS = (1000.0, 100.0, 0.01, 0.001)
 _LIKE = 1.15
@@ -83,7 +84,9 @@ def corrected(
 def fit_of(pair: Pair, alignment: Alignment) -> Fit:
     """Measure what correcting a pair would do."""
     period_s = 1e-9 * float(np.median(np.diff(pair.stamps_ns)))
-    least_s = max(_LEAST_OFFSET * period_s, _SIGNIFICANT * alignment.offset_error_s)
+    least_s = max(
+        min(_LEAST_OFFSET * period_s, _LEAST_OFFSET_S), _SIGNIFICANT * alignment.offset_error_s
+    )
     least_scale = max(_LEAST_SCALE, _SIGNIFICANT * alignment.scale_error)
     significant = {
         "time": abs(alignment.offset_s) > least_s,

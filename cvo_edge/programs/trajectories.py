@@ -133,8 +133,9 @@ def fits(pairs: Sequence[Pair]) -> list[Fit]:
         alignment = pair.aligned()
         if alignment is None:
             raise SourceError(
-                f"{pair.name}: expected at least {LEAST_MOTIONS} motions with a truth, found "
-                "fewer, or none that moves"
+                f"{pair.name}: expected at least {LEAST_MOTIONS} motions of half a second, or from "
+                "keyframe to keyframe, with a truth that moves, found fewer among "
+                f"{len(pair.stamps_ns)} poses"
             )
         _check_fit(pair, alignment)
         fit = fit_of(pair, alignment)

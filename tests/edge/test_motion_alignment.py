@@ -24,6 +24,16 @@ def test_a_time_offset_is_found(offset_ms: int) -> None:
     assert fit.effects["time"].worth == (offset_ms != 0)
 
 
+def test_keyframes_at_odd_times_show_a_time_offset() -> None:
+    pair = drive(1, 4000, noise=0.3)
+    kept = np.cumsum(np.random.default_rng(0).integers(5, 25, 250))
+    few = replace(pair, stamps_ns=pair.stamps_ns[kept] + 100_000_000, estimate=pair.estimate[kept])
+    found = few.aligned()
+    assert found is not None
+    assert abs(found.offset_s + 0.1) < 0.02
+    assert fit_of(few, found).effects["time"].worth
+
+
 def test_a_turned_body_and_a_scale_are_found_and_corrected() -> None:
     pair = drive(2, 600, noise=0.3)
     turn = np.deg2rad([0.5, -1.5, 0.8])
