@@ -29,6 +29,7 @@ from provenance import RESULTS, write_result
 
 from cvo_edge import geometry
 from cvo_edge.motion.adaptation import MotionAdaptation
+from cvo_edge.motion.annotation import annotate
 from cvo_edge.motion.audit import RecordingAudit, audit
 from cvo_edge.motion.conformalize import conformalize, trace_of
 from cvo_edge.motion.corrections import fit_of
@@ -37,7 +38,6 @@ from cvo_edge.motion.intervals import Level, MotionCalibration, MotionWindow
 from cvo_edge.motion.pairs import Pair
 from cvo_edge.motion.relative import motion, norms, residual
 from cvo_edge.motion.thresholds import Scores
-from cvo_edge.motion.tracker import annotate
 from cvo_edge.motion.windows import window_errors
 from cvo_edge.programs.trajectories import Files, Reading, correct_pairs, fits, read_pairs
 from cvo_edge.vocabulary import MOTION_RULES, MotionCorrection

@@ -14,6 +14,7 @@ most 1 / (G + 1).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.motion.errors import recent_rows
-from cvo_edge.motion.trace import RECENT, Rows, recent_numbers
+from cvo_edge.motion.kept import Kept
+from cvo_edge.motion.trace import RECENT, Rows, logarithms, recent_numbers
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -42,10 +44,22 @@ class Familiar(NamedTuple):
     def novelty(self, rows: Rows, ends: Integers) -> Array:
         """Return d (m,) at rows; NaN within a second after a break."""
         recent = recent_rows(rows, ends)
-        off = (recent_numbers(rows, recent, ends) - self.mean) / self.spread
-        over = np.maximum(off, 0.0)
-        novelty = np.sqrt(np.mean(over * over, axis=1))
+        over = self._over(recent_numbers(rows, recent, ends))
+        squares = np.add.reduce(over * over, axis=1)
+        novelty = np.sqrt(squares / len(self.mean))
         return np.where(_whole_second(rows, recent, ends), novelty, np.nan)
+
+    def latest(self, kept: Kept) -> float:
+        """Return d at the last row of a stream, the same to the last bit."""
+        end = len(kept) - 1
+        recent = kept.recent(end)
+        if 1e-9 * (kept.stamps_ns[end] - kept.stamps_ns[recent]) < _NEARLY * RECENT.value:
+            return math.nan
+        over = self._over(logarithms(np.array(kept.means(recent, end))[:, np.newaxis]).T)
+        return math.sqrt(float(np.add.reduce(over * over, axis=1)[0]) / len(self.mean))
+
+    def _over(self, numbers: Array) -> Array:
+        return np.maximum((np.ascontiguousarray(numbers) - self.mean) / self.spread, 0.0)
 
 
 class Running:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.motion.horizons import Horizon, starts
+from cvo_edge.motion.horizons import Horizon, starts_of
 from cvo_edge.motion.relative import motion, residual
 from cvo_edge.motion.trace import RECENT, Rows, motion_numbers, scale_numbers
 
@@ -45,8 +45,7 @@ def motions(
     ``ends``: the rows at which they may end; default: all.
     """
     every = np.arange(len(rows.part)) if ends is None else ends
-    along = horizon.along(rows.stamps_ns, rows.path_m)
-    start = starts(horizon, along, rows.part, every)
+    start = starts_of(horizon, rows.stamps_ns, rows.path_m, rows.part, every)
     found = start >= 0
     end = every[found]
     return start[found], end, recent_rows(rows, end)

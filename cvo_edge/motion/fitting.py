@@ -103,6 +103,31 @@ def predict_scale(scale: Scale, numbers: Array) -> Array:
     return np.asarray(np.exp(np.clip(logarithms, -_LARGEST_LOG, _LARGEST_LOG)))
 
 
+def predicted_bias(coefficients: Array, numbers: Array) -> Array:
+    """Return the biases (6, m) of motions with numbers (k - 1, m).
+
+    Coefficients are (k, 6, 1), or (k, 6, m) if each motion has its own. A motion gets the same bits
+    however many are predicted with it, which products of matrices do not promise.
+    """
+    return np.asarray(_in_order(numbers, coefficients[1:]) + coefficients[0])
+
+
+def predicted_scale(scale: Scale, numbers: Array) -> Array:
+    """Return the scales (8, m) of motions with numbers (k - 1, m), as ``predicted_bias``.
+
+    The ranges are (k - 1, 1) or (k - 1, m).
+    """
+    inside = np.minimum(np.maximum(numbers, scale.lowest), scale.highest)
+    logarithms = _in_order(inside, scale.coefficients[1:]) + scale.coefficients[0]
+    return np.asarray(np.exp(np.minimum(np.maximum(logarithms, -_LARGEST_LOG), _LARGEST_LOG)))
+
+
+def _in_order(numbers: Array, coefficients: Array) -> Array:
+    """Return sums over the first axis of (k, m) times (k, d, 1 or m), each in its order."""
+    products = np.multiply(numbers[:, np.newaxis], coefficients, order="C")
+    return np.asarray(np.add.reduce(products, axis=0))
+
+
 def eight(errors: Array) -> Array:
     """Errors (n, 6) -> their sizes and the two norms, (n, 8)."""
     return np.concatenate([np.abs(errors), norms(errors)], axis=1)

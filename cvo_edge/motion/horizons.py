@@ -8,7 +8,10 @@ crosses a break of the trajectory: a gap, a jump, or a pose that is no pose.
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -25,6 +28,9 @@ _FORM = re.compile(r"([0-9]+(?:\.[0-9]+)?)([fsm])")
 _LARGEST = 1e7
 # A motion over a time or a path that is further off than this share belongs to another horizon.
 _TOLERANCE = 0.2
+# Of frames and nanoseconds, sums are exact: where two poses are equally near, a stream and a file
+# agree.
+_INTEGERS = {"f": 1, "s": 1_000_000_000}
 
 
 @dataclass(frozen=True, order=True)
@@ -51,6 +57,16 @@ class Horizon:
         """Return e.g. ``5s``."""
         return f"{self.value:g}{self.unit}"
 
+    @cached_property
+    def reach(self) -> float:
+        """The value as a trace measures it: in frames or nanoseconds, integers, or metres."""
+        return self.value if self.unit == "m" else round(self.value * _INTEGERS[self.unit])
+
+    @cached_property
+    def tolerance(self) -> float:
+        """By how much a motion may be longer or shorter, in the same unit."""
+        return _TOLERANCE * self.value if self.unit == "m" else self.reach // round(1 / _TOLERANCE)
+
     def along(self, stamps_ns: Integers, path_m: Array) -> Array:
         """Return what the horizon is measured along, (n,): pose numbers, seconds or metres."""
         if self.unit == "f":
@@ -72,15 +88,55 @@ def starts(horizon: Horizon, along: Array, part: Integers, ends: Integers) -> In
     ends
         Shape (m,): numbers of poses.
     """
-    wanted = along[ends] - horizon.value
+    return _starts(along, horizon.value, _TOLERANCE * horizon.value, part, ends)
+
+
+def starts_of(
+    horizon: Horizon, stamps_ns: Integers, path_m: Array, part: Integers, ends: Integers
+) -> Integers:
+    """Return the same for the poses of a trace, as exactly as ``start_of``."""
+    if horizon.unit == "m":
+        return starts(horizon, path_m, part, ends)
+    along = stamps_ns if horizon.unit == "s" else np.arange(len(part))
+    return _starts(along, horizon.reach, horizon.tolerance, part, ends)
+
+
+def _starts(
+    along: Array | Integers, reach: float, tolerance: float, part: Integers, ends: Integers
+) -> Integers:
+    wanted = along[ends] - reach
     after = np.searchsorted(along, wanted)
     before = np.maximum(after - 1, 0)
     # Of two poses that are equally near, the earlier one counts.
     nearer = np.abs(along[before] - wanted) <= np.abs(along[after] - wanted)
     start = np.minimum(np.where(nearer, before, after), ends - 1)
     span = along[ends] - along[start]
-    fits = np.abs(span - horizon.value) <= _TOLERANCE * horizon.value
+    fits = np.abs(span - reach) <= tolerance
     return np.where((start >= 0) & fits & (part[start] == part[ends]), start, -1)
+
+
+def start_of(
+    horizon: Horizon,
+    stamps_ns: Sequence[int],
+    path_m: Sequence[float],
+    part: Sequence[int],
+    end: int,
+) -> int:
+    """Return the same for one pose of a stream, without looking at all of them."""
+    if horizon.unit == "f":
+        start = end - int(horizon.reach)
+        return start if start >= 0 and part[start] == part[end] else -1
+    if end == 0:
+        return -1
+    along = stamps_ns if horizon.unit == "s" else path_m
+    last = along[end]
+    wanted = last - horizon.reach
+    after = bisect_left(along, wanted, 0, end + 1)
+    before = max(after - 1, 0)
+    nearer = abs(along[before] - wanted) <= abs(along[after] - wanted)
+    start = min(before if nearer else after, end - 1)
+    fits = abs(last - along[start] - horizon.reach) <= horizon.tolerance
+    return start if fits and part[start] == part[end] else -1
 
 
 def path_length(poses: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from cvo_edge.errors import UsageError
 from cvo_edge.motion.covariance import SPANS_S, Shape
 from cvo_edge.motion.drift import Familiar
 from cvo_edge.motion.errors import motions
-from cvo_edge.motion.fitting import ERRORS, Scale, predict_bias, predict_scale
+from cvo_edge.motion.fitting import ERRORS, Scale, predicted_bias, predicted_scale
 from cvo_edge.motion.format import (
     COLUMNS,
     LEVELS,
@@ -31,6 +31,7 @@ from cvo_edge.vocabulary import MOTION_RULES, SCOPES, MotionRule, Scope
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Measure = TypeVar("Measure")
 
 # A robot at another rate needs a calibration of its own for horizons in frames.
 SAME_RATE = 0.2
@@ -73,17 +74,26 @@ class Level(NamedTuple):
 
 
 class MotionHorizon:
-    """One calibrated horizon."""
+    """One calibrated horizon.
+
+    Attributes
+    ----------
+    spec, horizon
+        What the file says, and how far back motions reach.
+    bias, scale
+        Coefficients as ``fitting.predicted_bias`` and ``predicted_scale`` take them, or None.
+    shape
+        Of the covariance ``interval``.
+    """
 
     def __init__(self, spec: HorizonSpec) -> None:
         self.spec = spec
         self.horizon = Horizon.parse(spec.horizon)
-        self._bias = None if spec.bias is None else np.array(spec.bias)
-        self._scale = None
+        self.bias = None if spec.bias is None else np.array(spec.bias)[..., np.newaxis]
+        self.scale = None
         if (scale := spec.scale) is not None:
-            self._scale = Scale(
-                np.array(scale.coefficients), np.array(scale.lowest), np.array(scale.highest)
-            )
+            fields = scale.coefficients, scale.lowest, scale.highest
+            self.scale = Scale(*(np.array(each)[..., np.newaxis] for each in fields))
         self._joint = np.array(spec.joint)
         self.shape = Shape(symmetric(spec.shape))
         self._thresholds = {
@@ -112,30 +122,21 @@ class MotionHorizon:
         scales[found.end] = found.scale[:, :6]
         return scales
 
-    def intervals(
-        self,
-        rows: Rows,
-        level: Level,
-        ends: Integers | None = None,
-        factor: Array | None = None,
-    ) -> Intervals:
-        """Return the intervals of all motions over this horizon, or of those with these ends.
-
-        ``factor`` (8,) is what labels have made of the thresholds.
-        """
+    def intervals(self, rows: Rows, level: Level, ends: Integers | None = None) -> Intervals:
+        """Return the intervals of all motions over this horizon, or of those with these ends."""
         start, end, recent = motions(rows, self.horizon, ends)
         moved, numbers = motion_numbers(rows, start, end)
-        bias = np.zeros((len(end), 6))
-        if self._bias is not None:
-            bias = predict_bias(self._bias, numbers)
-        scale = np.ones((len(end), ERRORS))
-        if self._scale is not None:
-            scale = predict_scale(self._scale, scale_numbers(rows, start, end, recent))
-        widths = scale * self.thresholds(level)
-        if factor is not None:
-            widths *= factor
-        half = widths[:, :6]
-        return Intervals(start, end, moved, bias, scale, bias - half, bias + half, widths[:, 6:])
+        bias = np.zeros((6, len(end)))
+        if self.bias is not None:
+            bias = predicted_bias(self.bias, numbers.T)
+        scale = np.ones((ERRORS, len(end)))
+        if self.scale is not None:
+            sizes = scale_numbers(rows, start, end, recent)
+            scale = predicted_scale(self.scale, sizes.T)
+        widths = scale * self.thresholds(level)[:, np.newaxis]
+        half = widths[:6]
+        lower, upper = bias - half, bias + half
+        return Intervals(start, end, moved, bias.T, scale.T, lower.T, upper.T, widths[6:].T)
 
 
 class MotionWindow:
@@ -169,17 +170,28 @@ class MotionWindow:
     def radii(self, rows: Rows, anchor: Integers, ends: Integers, level: Level) -> Array:
         """Return the radii (m, 2) at rows ``ends`` (m,) of position (m) and rotation (rad).
 
-        They are infinite beyond the window, over a break, and where ``anchor`` (m,) is -1.
+        They are infinite beyond the window and over a break since ``anchor`` (m,).
         """
-        along = self.window.along(rows.stamps_ns, rows.path_m)
-        since = along[ends] - along[anchor]
-        reaches = (anchor >= 0) & (since <= self.window.value)
-        reaches &= rows.part[anchor] == rows.part[ends]
-        q = self._thresholds[level.rule, level.confidence]
-        tube = q * radii(self._knots, self._profile, since)
+        frames = ends - anchor
+        seconds = 1e-9 * (rows.stamps_ns[ends] - rows.stamps_ns[anchor])
+        metres = rows.path_m[ends] - rows.path_m[anchor]
+        since = np.asarray(self.since(frames, seconds, metres), np.float64)
+        tube = self.after(since, level)
         # At the anchor itself, nothing has moved yet.
-        tube[ends == anchor] = 0.0
-        return np.where(reaches[:, np.newaxis], tube, np.inf)
+        tube[frames == 0] = 0.0
+        return np.where((rows.part[anchor] == rows.part[ends])[:, np.newaxis], tube, np.inf)
+
+    def since(self, frames: Measure, seconds: Measure, metres: Measure) -> Measure:
+        """Return what the window is measured along."""
+        if self.window.unit == "f":
+            return frames
+        return seconds if self.window.unit == "s" else metres
+
+    def after(self, since: Array, level: Level) -> Array:
+        """Return the radii (m, 2) so far (m,) after an anchor, infinite beyond the window."""
+        q = self._thresholds[level.rule, level.confidence]
+        inside = (since <= self.window.value)[:, np.newaxis]
+        return np.where(inside, q * radii(self._knots, self._profile, since), np.inf)
 
 
 class MotionCalibration:
@@ -232,24 +244,27 @@ class MotionCalibration:
             return poses
         return np.concatenate([self.file.correction.scale * poses[:, :3], poses[:, 3:]], axis=1)
 
-    def step_covariances(self, rows: Rows, ends: Integers) -> Array:
-        """Return the integrated covariance (m, 6, 6) of the steps that end at rows (m,).
+    @property
+    def steps(self) -> int:
+        """The place of the horizon that covariances ``integrated`` need.
 
-        It is in the body frame at the end of the step; NaN where no step ends. Raises UsageError if
-        the calibration has none.
+        Raises UsageError if the calibration has none.
         """
-        factors = self.file.integrated
-        steps = next((each for each in self.horizons if each.spec.horizon == "1f"), None)
-        if factors is None or steps is None:
+        names = [each.spec.horizon for each in self.horizons]
+        if self.file.integrated is None or "1f" not in names:
             raise UsageError(
                 "covariance: expected a calibration with the horizon 1f on drives of more than "
                 f"{SPANS_S[-1]:g} s for integrated, found none; use interval"
             )
-        found = steps.intervals(rows, Level(), ends)
-        covariances = np.full((len(ends), 6, 6), np.nan)
-        diagonal = np.array(factors) * found.scale[:, :6] ** 2
-        covariances[np.searchsorted(ends, found.end)] = diagonal[:, :, np.newaxis] * np.eye(6)
-        return covariances
+        return names.index("1f")
+
+    def step_covariances(self, scales: Array) -> Array:
+        """Return the covariances ``integrated`` (m, 6, 6) of steps with scales (m, 6).
+
+        They are in the body frame at the end of the step.
+        """
+        diagonal = np.array(self.file.integrated) * scales**2
+        return np.asarray(diagonal[:, :, np.newaxis] * np.eye(6))
 
     def same_rate(self, period_s: float) -> bool:
         """Whether poses come at the calibration's rate, which horizons in frames rely on."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Literal
 
@@ -12,10 +12,8 @@ from msgspec import UNSET, Struct, UnsetType
 from numpy.typing import NDArray
 
 from cvo_edge.estimate import RecordedPose, SixOrUnbounded, Status
-from cvo_edge.motion.covariance import Shape, in_fixed_axes
-from cvo_edge.motion.intervals import Intervals, Level, MotionCalibration
-from cvo_edge.motion.trace import Rows
-from cvo_edge.vocabulary import VERSION, MotionCovariance, MotionRule, Scope
+from cvo_edge.motion.intervals import Level, MotionCalibration
+from cvo_edge.vocabulary import VERSION, MotionRule, Scope
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -33,8 +31,8 @@ class MotionReason(StrEnum):
     RATE_DIFFERS = "rate_differs"  # ok: not the calibration's rate; horizons in frames lapse
 
 
-class _Strict(Struct, frozen=True, forbid_unknown_fields=True):
-    """Immutable; unknown keys are an error."""
+class _Strict(Struct, frozen=True, forbid_unknown_fields=True, gc=False):
+    """Immutable; unknown keys are an error. Without cycles, so that nobody need look for them."""
 
 
 class MotionInterval(_Strict, frozen=True):
@@ -175,170 +173,18 @@ def motion_header(calibration: MotionCalibration, level: Level) -> MotionHeader:
     )
 
 
-def records_of(
-    calibration: MotionCalibration,
-    level: Level,
-    rows: Rows,
-    numbers: Sequence[int],
-    reasons: Sequence[tuple[MotionReason, ...]],
-    anchors: Integers,
-    novelties: Sequence[float | None],
-    ends: Integers,
-    *,
-    frames: bool,
-    covariance: MotionCovariance | None = None,
-    factors: Sequence[Array] | None = None,
-) -> Iterator[MotionRecord]:
-    """Yield the records of some rows.
-
-    Parameters
-    ----------
-    calibration, level
-        What to state.
-    rows, numbers
-        The trajectory, and the number of each row in its stream.
-    reasons, anchors, novelties, ends
-        Remarks, the row of the anchor (-1 without one), D over its limit (``drift``) and the row of
-        each record, (m,).
-    frames
-        Whether horizons in frames apply.
-    covariance
-        What covariance to add.
-    factors
-        For each horizon what labels have made of its thresholds, (8,).
-    """
-    motions = []
-    for index, each in enumerate(calibration.horizons):
-        applies = frames or each.horizon.unit != "f"
-        factor = None if factors is None else factors[index]
-        found = each.intervals(rows, level, ends, factor) if applies else None
-        shape = each.shape if covariance == "interval" else None
-        motions.append(_motions(rows, numbers, each.spec.horizon, found, shape, factor))
-    tubes = [
-        _tube(
-            rows, numbers, each.spec.window, anchors, ends, each.radii(rows, anchors, ends, level)
-        )
-        for each in calibration.windows
-    ]
-    steps: list[list[float]] | None = None
-    if covariance == "integrated":
-        steps = calibration.step_covariances(rows, ends).reshape(-1, 36).tolist()
-    nothing = [MotionInterval(each.spec.horizon) for each in calibration.horizons]
-    stamps, poses = rows.stamps_ns[ends].tolist(), rows.poses[ends].tolist()
-    without = tuple(nothing)
-    for place, (end, stamp, pose, why, novelty) in enumerate(
-        zip(ends.tolist(), stamps, poses, reasons, novelties, strict=True)
-    ):
-        own = tuple(found.get(end, none) for found, none in zip(motions, nothing, strict=True))
-        tube = tuple(each[place] for each in tubes)
-        step = None if steps is None or not frames else _known(steps[place])
-        if novelty is not None and novelty > 1.0:
-            own, why = without, (MotionReason.MOTION_UNFAMILIAR, *why)
-            tube = tuple(SinceAnchor(each.spec.window) for each in calibration.windows)
-            step = None
-        known = pose[0] == pose[0]
-        yield MotionRecord(
-            numbers[end],
-            stamp,
-            _status(known, own),
-            why,
-            RecordedPose(tuple(pose[:3]), tuple(pose[3:])) if known else None,
-            own,
-            tube,
-            None if novelty is None else round(novelty, 4),
-            UNSET if steps is None else step,
-        )
+def recorded(values: Sequence[float]) -> RecordedPose | None:
+    """Return seven numbers as the pose of a record; None for a pose that is missing."""
+    x, y, z, a, b, c, d = values
+    return RecordedPose((x, y, z), (a, b, c, d)) if x == x else None
 
 
-def _known(values: list[float]) -> tuple[float, ...] | None:
-    return tuple(values) if values[0] == values[0] else None
+def six(values: Sequence[float]) -> SixOrUnbounded:
+    """Return six bounds; None for those that are infinite."""
+    a, b, c, d, e, f = (value if math.isfinite(value) else None for value in values)
+    return a, b, c, d, e, f
 
 
-def _tube(
-    rows: Rows,
-    numbers: Sequence[int],
-    name: str,
-    anchors: Integers,
-    ends: Integers,
-    radii: Array,
-) -> list[SinceAnchor]:
-    """Return the tube of one window at each row."""
-    seconds = 1e-9 * (rows.stamps_ns[ends] - rows.stamps_ns[anchors])
-    metres = rows.path_m[ends] - rows.path_m[anchors]
-    same = (anchors >= 0) & (rows.part[anchors] == rows.part[ends])
-    return [
-        SinceAnchor(name, numbers[anchor], time_s, path_m, *_finite(radius), radius[0] < math.inf)
-        if known
-        else SinceAnchor(name)
-        for known, anchor, time_s, path_m, radius in zip(
-            same.tolist(),
-            anchors.tolist(),
-            seconds.tolist(),
-            metres.tolist(),
-            radii.tolist(),
-            strict=True,
-        )
-    ]
-
-
-def _finite(values: list[float]) -> tuple[float | None, float | None]:
-    position, rotation = (value if value < math.inf else None for value in values)
-    return position, rotation
-
-
-def _status(known: bool, motion: tuple[MotionInterval, ...]) -> Status:
-    if not known:
-        return Status.INVALID
-    return Status.OK if any(each.bounded for each in motion) else Status.DEGRADED
-
-
-def _motions(
-    rows: Rows,
-    numbers: Sequence[int],
-    name: str,
-    found: Intervals | None,
-    shape: Shape | None,
-    factor: Array | None,
-) -> dict[int, MotionInterval]:
-    """Return the motions over one horizon by the row at which they end."""
-    if found is None:
-        return {}
-    seconds = 1e-9 * (rows.stamps_ns[found.end] - rows.stamps_ns[found.start])
-    metres = rows.path_m[found.end] - rows.path_m[found.start]
-    columns = (found.end, found.start, seconds, metres, found.moved, found.lower, found.upper)
-    covariances: list[tuple[float, ...] | UnsetType] = [UNSET] * len(found.end)
-    if shape is not None:
-        fixed = in_fixed_axes(shape.covariance(found.scale), found.moved[:, 3:])
-        covariances = [tuple(each) for each in fixed.reshape(-1, 36).tolist()]
-    adapted = UNSET if factor is None else tuple(factor.tolist())
-    motions: dict[int, MotionInterval] = {}
-    for (end, start, time_s, path_m, moved, lower, upper), (position, rotation) in zip(
-        zip(*(column.tolist() for column in columns), strict=True),
-        found.radii.tolist(),
-        strict=True,
-    ):
-        bounded = max(*upper, position, rotation) < math.inf
-        motions[end] = MotionInterval(
-            name,
-            numbers[start],
-            time_s,
-            path_m,
-            tuple(moved[:3]),
-            tuple(moved[3:]),
-            _six(lower),
-            _six(upper),
-            position if position < math.inf else None,
-            rotation if rotation < math.inf else None,
-            bounded,
-            covariances[len(motions)],
-            adapted,
-        )
-    return motions
-
-
-def _six(values: list[float]) -> SixOrUnbounded:
-    a, b, c, d, e, f = values
-    if abs(a + b + c + d + e + f) < math.inf:
-        return a, b, c, d, e, f
-    finite = [value if math.isfinite(value) else None for value in values]
-    return finite[0], finite[1], finite[2], finite[3], finite[4], finite[5]
+def finite(value: float) -> float | None:
+    """Return a radius; None if it is infinite."""
+    return value if value < math.inf else None

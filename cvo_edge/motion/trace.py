@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge import geometry
 from cvo_edge.motion.horizons import Horizon
-from cvo_edge.motion.relative import motion
+from cvo_edge.motion.relative import between, rotation_vectors
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -25,9 +24,9 @@ LAGS = 3
 # Averages are taken over this time, besides the motion itself.
 _RECENT_S = 1.0
 # Speed, turn rate and their changes per second: below these, a logarithm says nothing.
-_FLOORS = np.array([0.02, 0.01, 0.05, 0.05])
-_LEAST = 0.02
-_MEANS = len(_FLOORS)
+FLOORS = np.array([[0.02], [0.01], [0.05], [0.05]])
+LEAST = 0.02
+MEANS = len(FLOORS)
 
 
 class Limits(NamedTuple):
@@ -71,97 +70,52 @@ class Rows(NamedTuple):
     sums: Array
 
 
-def first_row(stamp_ns: int, pose: Array, columns: Array) -> Rows:
-    """Return the first row of a trace: pose (7,), columns (c,)."""
-    return Rows(
-        np.array([stamp_ns], np.int64),
-        _usable(pose[np.newaxis], columns[np.newaxis]),
-        np.zeros(1, np.int64),
-        np.zeros(1),
-        np.zeros((1, 6)),
-        np.zeros((1, 6)),
-        np.concatenate([np.zeros(_MEANS), _logarithms(columns)])[np.newaxis],
-    )
-
-
-def next_rows(
-    last: Rows, stamps_ns: Integers, poses: Array, columns: Array, limits: Limits
-) -> Rows:
-    """Return the rows of poses (m, 7) with later stamps (m,) and columns (m, c).
-
-    ``last`` is the row before; of more rows, the last one counts.
-    """
-    poses = _usable(poses, columns)
-    stamps = np.concatenate([last.stamps_ns[-1:], stamps_ns])
-    every = np.concatenate([last.poses[-1:], poses])
-    seconds = 1e-9 * np.diff(stamps)
-    step = motion(every[:-1], every[1:])
-    twist = np.concatenate([step[:, :3], geometry.quaternion_log(step[:, 3:])], axis=1)
-    twist /= seconds[:, np.newaxis]
-    speed, turn = _sizes(twist)
+def rows_of(stamps_ns: Integers, poses: Array, columns: Array, limits: Limits) -> Rows:
+    """Return the rows of all poses (n, 7) of a trajectory, with columns (n, c)."""
+    fine = np.asarray(np.isfinite(columns).all(axis=1))
+    poses = np.where(fine[:, np.newaxis], poses, np.nan)
+    seconds = 1e-9 * np.diff(stamps_ns)
+    step = between(poses[:-1].T, poses[1:].T)
+    twist = np.array([*step[:3], *rotation_vectors(*step[3:])]) / seconds
+    speed, turn = _size(twist[:3]), _size(twist[3:])
     # Comparisons with NaN are false: a pose that is no pose is a break, too.
     known = (seconds <= limits.gap_s) & (speed <= limits.speed) & (turn <= limits.turn)
-    twist[~known] = 0.0
-    before = np.concatenate([last.twist[-1:], twist[:-1]])
+    twist[:, ~known] = 0.0
+    change = np.zeros_like(twist)
     # The twist before is zero after a break. One that stands exactly still counts as unknown, too:
     # a row does not say which it is.
-    moving = before.any(axis=1)
-    change = np.where((known & moving)[:, np.newaxis], (twist - before) * limits.period_s, 0.0)
-    sizes = [*_sizes(twist), *_sizes(change / limits.period_s)]
-    values = np.concatenate([np.stack(sizes, axis=1), _logarithms(columns)], axis=1)
-    length_m = np.where(known, speed * seconds, 0.0)
+    changes = known[1:] & twist[:, :-1].any(axis=0)
+    change[:, 1:] = np.where(changes, (twist[:, 1:] - twist[:, :-1]) * limits.period_s, 0.0)
+    per_s = change / limits.period_s
+    sizes = [_size(each) for each in (twist[:3], twist[3:], per_s[:3], per_s[3:])]
+    values = np.concatenate([np.stack(sizes, axis=1), column_logarithms(columns[1:])], axis=1)
+    first = np.concatenate([np.zeros(MEANS), column_logarithms(columns[0])])
+    part = np.concatenate([[0], np.cumsum(~known)])
+    path_m = np.cumsum(np.concatenate([[0.0], np.where(known, speed * seconds, 0.0)]))
+    # Sums in the order of single additions.
+    sums = np.cumsum(np.concatenate([first[np.newaxis], values]), axis=0)
+    nothing = np.zeros((1, 6))
     return Rows(
         stamps_ns,
         poses,
-        last.part[-1] + np.cumsum(~known),
-        _summed(last.path_m[-1:], length_m),
-        twist,
-        change,
-        _summed(last.sums[-1:], values),
+        part,
+        path_m,
+        np.concatenate([nothing, twist.T]),
+        np.concatenate([nothing, change.T]),
+        sums,
     )
 
 
-def cut(rows: Rows, places: Integers | slice) -> Rows:
-    """Return some of the rows."""
-    return Rows(
-        rows.stamps_ns[places],
-        rows.poses[places],
-        rows.part[places],
-        rows.path_m[places],
-        rows.twist[places],
-        rows.change[places],
-        rows.sums[places],
-    )
-
-
-def rows_of(stamps_ns: Integers, poses: Array, columns: Array, limits: Limits) -> Rows:
-    """Return the rows of all poses (n, 7) of a trajectory, with columns (n, c)."""
-    first = first_row(int(stamps_ns[0]), poses[0], columns[0])
-    rest = next_rows(first, stamps_ns[1:], poses[1:], columns[1:], limits)
-    return Rows(*(np.concatenate(both) for both in zip(first, rest, strict=True)))
-
-
-def _usable(poses: Array, columns: Array) -> Array:
-    """Return poses (m, 7), NaN where a column (m, c) is not a number."""
-    fine = np.asarray(np.isfinite(columns).all(axis=1))
-    return np.asarray(np.where(fine[:, np.newaxis], poses, np.nan))
-
-
-def _summed(start: Array, values: Array) -> Array:
-    """Return running sums in the order of single additions."""
-    return np.asarray(np.cumsum(np.concatenate([start, values]), axis=0)[1:])
-
-
-def _sizes(twists: Array) -> tuple[Array, Array]:
-    halves = twists.reshape(-1, 2, 3)
-    sizes = np.sqrt((halves * halves).sum(axis=2))
-    return sizes[:, 0], sizes[:, 1]
-
-
-def _logarithms(columns: Array) -> Array:
+def column_logarithms(columns: Array) -> Array:
+    """Return the logarithms of columns of the file."""
     # Of a pose that is missing, which is a break, any number does.
     finite = np.where(np.isfinite(columns), columns, 1.0)
     return np.asarray(np.log(np.maximum(finite, 1e-12)))
+
+
+def _size(vectors: Array) -> Array:
+    x, y, z = vectors
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def motion_numbers(rows: Rows, start: Integers, end: Integers) -> tuple[Array, Array]:
@@ -169,13 +123,13 @@ def motion_numbers(rows: Rows, start: Integers, end: Integers) -> tuple[Array, A
 
     These are the motion itself (m, rad) and the changes at its end.
     """
-    moved = motion(rows.poses[start], rows.poses[end])
-    numbers = [moved[:, :3], geometry.quaternion_log(moved[:, 3:])]
+    moved = np.array(between(rows.poses[start].T, rows.poses[end].T))
+    numbers = [moved[:3], np.array(rotation_vectors(*moved[3:]))]
     for lag in range(LAGS):
         row = np.maximum(end - lag, 0)
         same = (rows.part[row] == rows.part[end]) & (end >= lag)
-        numbers.append(np.where(same[:, np.newaxis], rows.change[row], 0.0))
-    return moved, np.concatenate(numbers, axis=1)
+        numbers.append(np.where(same, rows.change[row].T, 0.0))
+    return moved.T, np.concatenate(numbers).T
 
 
 def scale_numbers(rows: Rows, start: Integers, end: Integers, recent: Integers) -> Array:
@@ -183,36 +137,39 @@ def scale_numbers(rows: Rows, start: Integers, end: Integers, recent: Integers) 
 
     ``recent``: the row one second before the end, or the first row of its part.
     """
-    means = (rows.sums[end] - rows.sums[start]) / (end - start)[:, np.newaxis]
-    now = _recent_means(rows, recent, end)
+    means, now = _means(rows, start, end), _means(rows, recent, end)
     seconds = 1e-9 * (rows.stamps_ns[end] - rows.stamps_ns[start])
-    extent = np.stack([seconds, rows.path_m[end] - rows.path_m[start]], axis=1)
+    extent = np.stack([seconds, rows.path_m[end] - rows.path_m[start]])
     sizes = [
-        np.log(means[:, :_MEANS] + _FLOORS),
-        np.log(now[:, :_MEANS] + _FLOORS),
-        np.log(np.abs(rows.twist[end]) + _LEAST),
-        np.log(extent + _LEAST),
-        means[:, _MEANS:],
-        now[:, _MEANS:],
+        np.log(means[:MEANS] + FLOORS),
+        np.log(now[:MEANS] + FLOORS),
+        np.log(np.abs(rows.twist[end].T) + LEAST),
+        np.log(extent + LEAST),
+        means[MEANS:],
+        now[MEANS:],
     ]
-    return np.concatenate(sizes, axis=1)
+    return np.concatenate(sizes).T
 
 
 RECENT = Horizon("s", _RECENT_S)
+RECENT_NS = round(1e9 * _RECENT_S)
 
 
 def recent_numbers(rows: Rows, recent: Integers, end: Integers) -> Array:
     """Return logarithms of the means over the last second, (m, 4 + columns)."""
-    now = _recent_means(rows, recent, end)
-    return np.concatenate([np.log(now[:, :_MEANS] + _FLOORS), now[:, _MEANS:]], axis=1)
+    return logarithms(_means(rows, recent, end)).T
 
 
-def _recent_means(rows: Rows, recent: Integers, end: Integers) -> Array:
-    return np.asarray(
-        (rows.sums[end] - rows.sums[recent]) / np.maximum(end - recent, 1)[:, np.newaxis]
-    )
+def logarithms(means: Array) -> Array:
+    """Return logarithms of the first four of means (4 + columns, m); columns are logarithms."""
+    return np.concatenate([np.log(means[:MEANS] + FLOORS), means[MEANS:]])
+
+
+def _means(rows: Rows, start: Integers, end: Integers) -> Array:
+    """Return the means of what is summed, (4 + columns, m)."""
+    return np.asarray((rows.sums[end] - rows.sums[start]).T / np.maximum(end - start, 1))
 
 
 def scale_width(columns: int) -> int:
     """Return how many numbers ``scale_numbers`` gives with this many columns of a file."""
-    return 2 * _MEANS + 6 + 2 + 2 * columns
+    return 2 * MEANS + 6 + 2 + 2 * columns

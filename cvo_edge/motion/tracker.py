@@ -1,142 +1,47 @@
-"""Intervals on the motion of an estimator, pose by pose or for a whole trajectory."""
+"""Intervals on the motion of an estimator as its poses come."""
 
 from __future__ import annotations
 
+import math
 import os
-from bisect import bisect_left
-from collections.abc import Iterator, Mapping
+from bisect import bisect_left, insort
+from collections import deque
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, get_args
 
 import numpy as np
+from msgspec import UNSET, UnsetType
 from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.documents import shown
 from cvo_edge.errors import UsageError
 from cvo_edge.estimate import Status
 from cvo_edge.motion.adaptation import MotionAdaptation
+from cvo_edge.motion.annotation import status_of
+from cvo_edge.motion.covariance import in_fixed_axes
 from cvo_edge.motion.drift import Running
-from cvo_edge.motion.fitting import eight
-from cvo_edge.motion.intervals import Level, MotionCalibration, MotionHorizon
+from cvo_edge.motion.ending import Ending, Endings
+from cvo_edge.motion.fitting import ERRORS, eight
+from cvo_edge.motion.intervals import MotionCalibration
 from cvo_edge.motion.kept import KEPT, Kept, nanoseconds, seven
 from cvo_edge.motion.records import (
     MotionInterval,
     MotionReason,
     MotionRecord,
     SinceAnchor,
-    records_of,
+    finite,
+    recorded,
+    six,
 )
 from cvo_edge.motion.relative import motion, residual
-from cvo_edge.motion.trace import Rows, cut, first_row, next_rows, rows_of
+from cvo_edge.motion.trace import column_logarithms
 from cvo_edge.pose import Pose
 from cvo_edge.vocabulary import MotionCovariance, MotionRule, Scope
 
 Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # The rate is the median of so many steps.
 _RATE_OF = 15
-
-
-def annotate(
-    calibration: MotionCalibration,
-    level: Level,
-    stamps_ns: Integers,
-    poses: Array,
-    columns: Mapping[str, Array],
-    anchors_ns: ArrayLike = (),
-    covariance: MotionCovariance | None = None,
-) -> Iterator[MotionRecord]:
-    """Yield the records of a whole trajectory.
-
-    Parameters
-    ----------
-    calibration, level
-        What to state.
-    stamps_ns, poses
-        Shape (n,), ascending, and (n, 7): ``T_world_body``, NaN where there is no pose.
-    columns
-        Shape (n,) each; those that the calibration names are needed.
-    anchors_ns
-        Stamps of poses that are taken as known, besides the first one.
-    covariance
-        What covariance to add to the records.
-
-    Raises UsageError if a column is missing, an anchor is no pose of the trajectory, or the
-    calibration does not have the covariance.
-    """
-    values = np.empty((len(stamps_ns), len(calibration.file.columns)))
-    for place, name in enumerate(calibration.file.columns):
-        if name not in columns:
-            raise UsageError(f"columns: expected {name}, found {', '.join(columns) or 'none'}")
-        values[:, place] = columns[name]
-    rows = rows_of(stamps_ns, calibration.scaled(poses), values, calibration.limits)
-    steps = 1e-9 * np.diff(stamps_ns)
-    differs = len(steps) > 0 and not calibration.same_rate(float(np.median(steps)))
-    ends = np.arange(len(stamps_ns))
-    known = np.zeros_like(ends)
-    for stamp_ns in np.asarray(anchors_ns, np.int64).tolist():
-        row = row_at(rows, stamp_ns)
-        known[row] = row
-    return records_of(
-        calibration,
-        level,
-        rows,
-        range(len(stamps_ns)),
-        _reasons(calibration, rows, 0, differs),
-        np.maximum.accumulate(known),
-        _novelties(calibration, Running(calibration.limits.period_s), rows, ends),
-        ends,
-        frames=not differs,
-        covariance=covariance,
-    )
-
-
-def _novelties(
-    calibration: MotionCalibration, running: Running, rows: Rows, ends: Integers
-) -> list[float | None]:
-    """Return D over its limit at rows; see ``drift``."""
-    found = running.all(calibration.familiar.novelty(rows, ends), rows.part[ends])
-    limit = calibration.familiar.limit
-    return [None if value is None else value / limit for value in found]
-
-
-def row_at(rows: Rows, stamp_ns: int) -> int:
-    """Return the row of a pose with this stamp; raises UsageError if there is none."""
-    row = int(np.searchsorted(rows.stamps_ns, stamp_ns))
-    if row == len(rows.stamps_ns) or rows.stamps_ns[row] != stamp_ns:
-        raise UsageError(
-            f"stamp: expected that of a pose, found {stamp_ns}; poses from "
-            f"{rows.stamps_ns[0]} to {rows.stamps_ns[-1]}"
-        )
-    if not np.isfinite(rows.poses[row]).all():
-        raise UsageError(f"stamp: expected a pose at {stamp_ns}, found none: it is missing")
-    return row
-
-
-def _reasons(
-    calibration: MotionCalibration, rows: Rows, first: int, differs: bool
-) -> list[tuple[MotionReason, ...]]:
-    """Return the remarks on rows from ``first`` on; row 0 has nothing before it."""
-    # Of a stream, only the last rows are asked for.
-    before = max(first - 1, 0)
-    rows = cut(rows, slice(before, None))
-    missing: Mask = ~np.asarray(np.isfinite(rows.poses).all(axis=1))
-    broken: Mask = np.concatenate([[True], rows.part[1:] != rows.part[:-1]])
-    seconds = np.concatenate([[0.0], 1e-9 * np.diff(rows.stamps_ns)])
-    late: Mask = (seconds > calibration.limits.gap_s) | np.concatenate([[False], missing[:-1]])
-    always = (MotionReason.RATE_DIFFERS,) if differs else ()
-    found: list[tuple[MotionReason, ...]] = []
-    for place in range(first - before, len(rows.part)):
-        if missing[place]:
-            found.append((MotionReason.POSE_MISSING,))
-        elif not broken[place]:
-            found.append(always)
-        elif before + place == 0:
-            found.append((MotionReason.TRAJECTORY_STARTED, *always))
-        else:
-            found.append((MotionReason.GAP if late[place] else MotionReason.JUMP, *always))
-    return found
 
 
 class MotionUpdate(NamedTuple):
@@ -158,7 +63,7 @@ class MotionUpdate(NamedTuple):
 class MotionTracker:
     """Intervals on an estimator's motion as its poses come.
 
-    The records are those that ``annotate`` gives for the same poses, up to rounding, but for the
+    The records are those that ``annotate`` gives for the same poses, to the last bit, but for the
     rate, which is not known before some poses have come. Not safe for use by several threads.
 
     Parameters
@@ -198,19 +103,36 @@ class MotionTracker:
             )
         self.calibration = calibration
         self.level = calibration.level(confidence, rule, scope)
-        self._covariance = covariance
+        self._steps = calibration.steps if covariance == "integrated" else None
+        self._of_motions = covariance == "interval"
         self._adaptations = None
         if adapt:
             self._adaptations = [
                 MotionAdaptation(1.0 - confidence, joint=scope == "joint")
                 for _ in calibration.horizons
             ]
-        self._truths: dict[int, Array] = {}
-        self._running = Running(calibration.limits.period_s)
-        self._kept = Kept()
+        columns = len(calibration.file.columns)
+        self._factors: Array | None = None
+        if adapt:
+            self._factors = np.ones((ERRORS, len(calibration.horizons)))
+        self._endings = Endings(calibration.horizons, self.level, columns)
+        # Where a threshold is infinite, so is the bound, whatever the motion.
+        self._bounded = [
+            bool(np.isfinite(each.thresholds(self.level)).all()) for each in calibration.horizons
+        ]
+        self._nothing = tuple(MotionInterval(each.spec.horizon) for each in calibration.horizons)
+        self._outside = tuple(SinceAnchor(each.spec.window) for each in calibration.windows)
         self._seq = 0
         # By number, as rows move when old ones are dropped.
         self._anchor_seq = 0
+        self._start()
+
+    def _start(self) -> None:
+        """Forget what came before."""
+        self._kept = Kept(self.calibration.limits, len(self.calibration.file.columns))
+        self._running = Running(self.calibration.limits.period_s)
+        self._rate = _Rate()
+        self._truths: dict[int, Array] = {}
 
     def anchor(self, stamp_ns: int) -> None:
         """Take the pose with this stamp as known from now on: tubes start there.
@@ -218,10 +140,22 @@ class MotionTracker:
         The first pose is the first anchor. Raises UsageError for a stamp that is not that of a
         pose, or of one that is no longer kept.
         """
-        rows = self._kept.rows
-        if rows is None:
-            raise UsageError("anchor: expected a pose, found none so far")
-        self._anchor_seq = self._kept.numbers[row_at(rows, nanoseconds(stamp_ns))]
+        self._anchor_seq = self._kept.numbers[self._row_at("anchor", stamp_ns)]
+
+    def _row_at(self, what: str, stamp_ns: int) -> int:
+        """Return the row of a pose with this stamp; raises UsageError if there is none."""
+        stamps = self._kept.stamps_ns
+        if not stamps:
+            raise UsageError(f"{what}: expected a pose, found none so far")
+        row = bisect_left(stamps, nanoseconds(stamp_ns))
+        if row == len(stamps) or stamps[row] != stamp_ns:
+            raise UsageError(
+                f"stamp: expected that of a pose, found {stamp_ns}; poses from {stamps[0]} to "
+                f"{stamps[-1]}"
+            )
+        if math.isnan(self._kept.pose(row)[0]):
+            raise UsageError(f"stamp: expected a pose at {stamp_ns}, found none: it is missing")
+        return row
 
     def observe(self, stamp_ns: int, pose: Pose | ArrayLike) -> MotionUpdate:
         """Take the true pose of the body at the stamp of an earlier pose, as late as it comes.
@@ -232,47 +166,40 @@ class MotionTracker:
         """
         if self._adaptations is None:
             raise UsageError("observe: expected a tracker with adapt=True, found one without")
-        rows = self._kept.rows
-        if rows is None:
-            raise UsageError("observe: expected a pose, found none so far")
-        end = row_at(rows, nanoseconds(stamp_ns))
+        end = self._row_at("observe", stamp_ns)
         seq = self._kept.numbers[end]
         if seq in self._truths:
             raise UsageError(f"observe: expected each stamp once, found {stamp_ns} again")
-        truth = seven(pose)
+        truth = np.array(seven(pose))
         if not np.isfinite(truth).all():
             raise UsageError(f"observe: expected a true pose, found {shown(pose)}")
         self._truths[seq] = truth
         if len(self._truths) > KEPT:
             del self._truths[next(iter(self._truths))]
-        covered = []
-        for horizon, adaptation in zip(self.calibration.horizons, self._adaptations, strict=True):
-            found = self._scores(rows, horizon, end)
+        found = self._endings.at(self._kept, end)
+        covered: list[tuple[bool, ...] | None] = []
+        for place, adaptation in enumerate(self._adaptations):
+            scores = self._scores(found, place, truth)
             inside = None
-            if found is not None:
-                inside = adaptation.update(seq, self._kept.numbers[-1], *found)
+            if scores is not None:
+                span = end - found.start[place]
+                inside = adaptation.update(seq, self._kept.numbers[-1], span, scores)
             covered.append(None if inside is None else tuple(inside.tolist()))
-        return MotionUpdate(tuple(covered), tuple(tuple(each.tolist()) for each in self._factors()))
+        self._factors = np.exp([each.x for each in self._adaptations]).T
+        return MotionUpdate(tuple(covered), tuple(map(tuple, self._factors.T.tolist())))
 
-    def _scores(self, rows: Rows, horizon: MotionHorizon, end: int) -> tuple[int, Array] | None:
-        """Return the rows of a motion and its scores (8,) over calibrated thresholds.
+    def _scores(self, found: Ending, place: int, truth: Array) -> Array | None:
+        """Return the scores (8,) of the motion over one horizon, over calibrated thresholds.
 
-        None if the truth is not known at both ends.
+        None if there is no motion, or no truth where it starts.
         """
-        found = horizon.intervals(rows, self.level, np.array([end]))
-        if not len(found.end):
+        if (start := found.start[place]) < 0:
             return None
-        numbers = self._kept.numbers
-        first, last = (self._truths.get(numbers[row]) for row in (found.start[0], end))
-        if first is None or last is None:
+        first = self._truths.get(self._kept.numbers[start])
+        if first is None:
             return None
-        off = residual(found.moved, motion(first, last)[np.newaxis]) - found.bias
-        widths = np.concatenate([0.5 * (found.upper - found.lower), found.radii], axis=1)
-        scores = eight(off)[0] / widths[0]
-        return (end - int(found.start[0]), scores) if np.isfinite(off).all() else None
-
-    def _factors(self) -> list[Array]:
-        return [np.exp(each.x) for each in self._adaptations or ()]
+        off = residual(np.array(found.moved[place]), motion(first, truth)) - found.bias[:, place]
+        return np.asarray(eight(off[np.newaxis])[0] / found.widths[:, place])
 
     def step(
         self,
@@ -297,28 +224,25 @@ class MotionTracker:
         same, gives an ``invalid`` record and changes nothing.
         """
         stamp_ns = nanoseconds(stamp_ns)
-        whole = self.calibration.scaled(seven(pose)[np.newaxis])
-        given = self._given(columns, lost=not np.isfinite(whole).all())
+        values = seven(pose)
+        logarithms: Sequence[float] = ()
+        if self.calibration.file.columns:
+            given = self._given(columns, lost=math.isnan(values[0]))
+            values = values if np.isfinite(given).all() else seven(None)
+            logarithms = column_logarithms(given).tolist()
+        if (scale := self.calibration.file.correction.scale) is not None:
+            values = (*(scale * each for each in values[:3]), *values[3:])
         seq, self._seq = self._seq, self._seq + 1
-        self._restart_before(stamp_ns)
-        rows = self._kept.rows
-        if rows is not None and stamp_ns <= rows.stamps_ns[-1]:
-            return MotionRecord(
-                seq,
-                stamp_ns,
-                Status.INVALID,
-                (MotionReason.STAMP_NOT_LATER,),
-                None,
-                tuple(MotionInterval(each.spec.horizon) for each in self.calibration.horizons),
-                tuple(SinceAnchor(each.spec.window) for each in self.calibration.windows),
-                None,
-            )
-        if rows is None:
-            row = first_row(stamp_ns, whole[0], given)
-        else:
-            stamp = np.array([stamp_ns], np.int64)
-            row = next_rows(rows, stamp, whole, given[np.newaxis], self.calibration.limits)
-        return self._record(self._kept.add(seq, row))
+        stamps = self._kept.stamps_ns
+        if stamps and 1e-9 * (stamps[-1] - stamp_ns) > self.calibration.limits.gap_s:
+            # A clock was set, or one was wrong.
+            self._start()
+        elif stamps and stamp_ns <= stamps[-1]:
+            reasons = (MotionReason.STAMP_NOT_LATER,)
+            motion, since = self._nothing, self._outside
+            return MotionRecord(seq, stamp_ns, Status.INVALID, reasons, None, motion, since, None)
+        self._kept.add(seq, stamp_ns, values, logarithms)
+        return self._record(seq, stamp_ns, values)
 
     def _given(self, columns: Mapping[str, float] | None, *, lost: bool) -> Array:
         """Return the values of the calibration's columns; a lost estimator needs none."""
@@ -332,36 +256,129 @@ class MotionTracker:
                 f"columns: expected numbers for {', '.join(names)}, found {shown(columns)}"
             ) from None
 
-    def _restart_before(self, stamp_ns: int) -> None:
-        """Forget what came before if a stamp goes far back: a clock was set, or one was wrong."""
-        rows = self._kept.rows
-        if rows is None:
-            return
-        if 1e-9 * float(rows.stamps_ns[-1] - stamp_ns) > self.calibration.limits.gap_s:
-            self._kept = Kept()
-            self._truths = {}
-            self._running = Running(self.calibration.limits.period_s)
+    def _record(self, seq: int, stamp_ns: int, values: Sequence[float]) -> MotionRecord:
+        calibration, kept = self.calibration, self._kept
+        period_s = self._rate.period_s(kept)
+        differs = period_s is not None and not calibration.same_rate(period_s)
+        reasons = self._reasons(differs)
+        motion, since = self._nothing, self._outside
+        step: tuple[float, ...] | UnsetType | None = UNSET if self._steps is None else None
+        value = self._running.add(calibration.familiar.latest(kept), kept.part[-1])
+        novelty = None if value is None else value / calibration.familiar.limit
+        if novelty is not None and novelty > 1.0:
+            reasons = (MotionReason.MOTION_UNFAMILIAR, *reasons)
+        else:
+            found = self._endings.at(kept, len(kept) - 1, frames=not differs, factors=self._factors)
+            motion, since = self._motions(found), self._tubes()
+            if self._steps is not None and found.start[self._steps] >= 0:
+                scales = found.scale[:6, self._steps]
+                step = tuple(calibration.step_covariances(scales[np.newaxis]).ravel().tolist())
+        pose = recorded(values)
+        return MotionRecord(
+            seq,
+            stamp_ns,
+            status_of(pose, motion),
+            reasons,
+            pose,
+            motion,
+            since,
+            None if novelty is None else round(novelty, 4),
+            step,
+        )
 
-    def _record(self, rows: Rows) -> MotionRecord:
-        end = np.array([len(rows.part) - 1])
-        steps = np.diff(rows.stamps_ns[-_RATE_OF - 1 :])
-        differs = len(steps) == _RATE_OF and not self.calibration.same_rate(
-            1e-9 * float(np.median(steps))
-        )
-        numbers = self._kept.numbers
-        anchor = bisect_left(numbers, self._anchor_seq)
-        known = numbers[anchor] == self._anchor_seq
-        (record,) = records_of(
-            self.calibration,
-            self.level,
-            rows,
-            numbers,
-            _reasons(self.calibration, rows, int(end[0]), differs),
-            np.array([anchor if known else -1]),
-            _novelties(self.calibration, self._running, rows, end),
-            end,
-            frames=not differs,
-            covariance=self._covariance,
-            factors=self._factors() if self._adaptations is not None else None,
-        )
-        return record
+    def _reasons(self, differs: bool) -> tuple[MotionReason, ...]:
+        """Return the remarks on the last row."""
+        kept = self._kept
+        always = (MotionReason.RATE_DIFFERS,) if differs else ()
+        last = len(kept) - 1
+        if math.isnan(kept.pose(last)[0]):
+            return (MotionReason.POSE_MISSING,)
+        if last == 0:
+            return (MotionReason.TRAJECTORY_STARTED, *always)
+        if kept.part[last] == kept.part[last - 1]:
+            return always
+        late = 1e-9 * (kept.stamps_ns[last] - kept.stamps_ns[last - 1])
+        lost = math.isnan(kept.pose(last - 1)[0])
+        gap = late > self.calibration.limits.gap_s or lost
+        return (MotionReason.GAP if gap else MotionReason.JUMP, *always)
+
+    def _motions(self, found: Ending) -> tuple[MotionInterval, ...]:
+        """Return the motions that end at the last row."""
+        half, numbers = found.widths[:6], self._kept.numbers
+        lower, upper = (found.bias - half).T.tolist(), (found.bias + half).T.tolist()
+        radii = found.widths[6:].T.tolist()
+        factors = None if self._factors is None else self._factors.T.tolist()
+        covariances: list[tuple[float, ...] | UnsetType] = [UNSET] * len(radii)
+        if self._of_motions:
+            every = zip(self.calibration.horizons, found.scale.T, strict=True)
+            own = [each.shape.covariance(scale[np.newaxis])[0] for each, scale in every]
+            fixed = in_fixed_axes(np.array(own), np.array(found.moved)[:, 3:])
+            covariances = list(map(tuple, fixed.reshape(-1, 36).tolist()))
+        motions = []
+        for place, (start, none, bounded) in enumerate(
+            zip(found.start, self._nothing, self._bounded, strict=True)
+        ):
+            if start < 0:
+                motions.append(none)
+                continue
+            x, y, z, a, b, c, d = found.moved[place]
+            position, rotation = radii[place]
+            motions.append(
+                MotionInterval(
+                    none.horizon,
+                    numbers[start],
+                    found.seconds[place],
+                    found.metres[place],
+                    (x, y, z),
+                    (a, b, c, d),
+                    tuple(lower[place]) if bounded else six(lower[place]),
+                    tuple(upper[place]) if bounded else six(upper[place]),
+                    finite(position),
+                    finite(rotation),
+                    bounded,
+                    covariances[place],
+                    UNSET if factors is None else tuple(factors[place]),
+                )
+            )
+        return tuple(motions)
+
+    def _tubes(self) -> tuple[SinceAnchor, ...]:
+        """Return the tubes at the last row."""
+        kept, last = self._kept, len(self._kept) - 1
+        row = bisect_left(kept.numbers, self._anchor_seq)
+        if kept.numbers[row] != self._anchor_seq or kept.part[row] != kept.part[last]:
+            return self._outside
+        seconds = 1e-9 * (kept.stamps_ns[last] - kept.stamps_ns[row])
+        metres = kept.path_m[last] - kept.path_m[row]
+        tubes = []
+        for window in self.calibration.windows:
+            since = window.since(last - row, seconds, metres)
+            radii = [0.0, 0.0] if row == last else [math.inf, math.inf]
+            if row < last and since <= window.window.value:
+                radii = window.after(np.array([since]), self.level)[0].tolist()
+            position, rotation = map(finite, radii)
+            bounded = max(radii) < math.inf
+            name = window.spec.window
+            tubes.append(
+                SinceAnchor(name, self._anchor_seq, seconds, metres, position, rotation, bounded)
+            )
+        return tuple(tubes)
+
+
+class _Rate:
+    """The time between poses: the median of the last steps."""
+
+    def __init__(self) -> None:
+        self._steps: deque[int] = deque()
+        self._sorted: list[int] = []
+
+    def period_s(self, kept: Kept) -> float | None:
+        """Take the last step of a stream and return seconds; None before enough have come."""
+        if len(kept) < 2:
+            return None
+        step = kept.stamps_ns[-1] - kept.stamps_ns[-2]
+        if len(self._steps) == _RATE_OF:
+            del self._sorted[bisect_left(self._sorted, self._steps.popleft())]
+        self._steps.append(step)
+        insort(self._sorted, step)
+        return 1e-9 * self._sorted[_RATE_OF // 2] if len(self._steps) == _RATE_OF else None

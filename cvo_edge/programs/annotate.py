@@ -13,11 +13,12 @@ import msgspec
 import numpy as np
 
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.motion.annotation import annotate
 from cvo_edge.motion.files import Poses
 from cvo_edge.motion.format import COLUMNS
 from cvo_edge.motion.intervals import Level, MotionCalibration
 from cvo_edge.motion.records import MotionRecord, motion_header
-from cvo_edge.motion.tracker import MotionTracker, annotate
+from cvo_edge.motion.tracker import MotionTracker
 from cvo_edge.output.lines import LineFile
 from cvo_edge.output.sinks import tum_line
 from cvo_edge.process import say

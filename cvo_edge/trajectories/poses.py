@@ -22,7 +22,7 @@ _MAX_MATRIX_BYTES = 1 << 16
 _TOLERANCE = 0.01
 _LAST_ROW = 1e-6
 # Further away than the moon: no coordinates of a place. Networks' outputs have the same limit.
-_FARTHEST_M = 1e9
+FARTHEST_M = 1e9
 
 
 def quaternion_pose(position_m: Array, q_xyzw: Array) -> Array | None:
@@ -40,9 +40,7 @@ def quaternion_poses(positions_m: Array, q_xyzw: Array) -> tuple[list[Array | No
     """Do the same for positions (n, 3) and quaternions (n, 4); faults are "" for valid poses."""
     with np.errstate(all="ignore"):
         norms = np.linalg.norm(q_xyzw, axis=1)
-        valid = (np.abs(norms - 1.0) <= _TOLERANCE) & (np.abs(positions_m) < _FARTHEST_M).all(
-            axis=1
-        )
+        valid = (np.abs(norms - 1.0) <= _TOLERANCE) & (np.abs(positions_m) < FARTHEST_M).all(axis=1)
         every = np.concatenate([positions_m, geometry.quaternion_normalise(q_xyzw)], axis=1)
     poses = [pose if fine else None for pose, fine in zip(every, valid.tolist(), strict=True)]
     faults = [
@@ -67,7 +65,7 @@ def _position_fault(position_m: Array) -> str | None:
     if not np.isfinite(position_m).all():
         return "a number that is not finite"
     most = float(np.abs(position_m).max())
-    return None if most < _FARTHEST_M else f"a position {most:.3g} m from the origin"
+    return None if most < FARTHEST_M else f"a position {most:.3g} m from the origin"
 
 
 def camera_pose(pose: Array | None, T_body_camera: Array) -> Array | None:
@@ -97,7 +95,7 @@ def matrices_to_poses(T: Array) -> tuple[list[Array | None], list[str]]:
     every = np.concatenate([T[:, :3, 3], geometry.matrix_to_quaternion(R)], axis=1)
     with np.errstate(invalid="ignore"):
         off = np.abs(R - T[:, :3, :3]).max(axis=(1, 2))
-        near = (np.abs(T[:, :3, 3]) < _FARTHEST_M).all(axis=1)
+        near = (np.abs(T[:, :3, 3]) < FARTHEST_M).all(axis=1)
         valid = whole & near & (off <= _TOLERANCE)
     valid &= np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) <= _LAST_ROW
     poses = [pose if fine else None for pose, fine in zip(every, valid.tolist(), strict=True)]

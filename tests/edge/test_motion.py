@@ -13,9 +13,10 @@ from cvo_edge.motion.conformalize import limits_of, trace_of
 from cvo_edge.motion.errors import errors_of
 from cvo_edge.motion.fitting import Normal, bias_sums, predict_bias, solve_bias
 from cvo_edge.motion.horizons import Horizon, starts
+from cvo_edge.motion.kept import Kept
 from cvo_edge.motion.relative import motion, norms, residual
 from cvo_edge.motion.thresholds import CAP, Scores
-from cvo_edge.motion.trace import Limits, first_row, next_rows, rows_of
+from cvo_edge.motion.trace import Limits, column_logarithms, rows_of
 from cvo_edge.vocabulary import MOTION_RULES
 
 from .simulated_drives import chained, composed, drive, smooth, twist
@@ -104,14 +105,17 @@ def test_a_trace_is_the_same_pose_by_pose() -> None:
     stamps[50:] += 10**9
     columns = np.random.default_rng(0).uniform(0.1, 2.0, (len(poses), 2))
     whole = rows_of(stamps, poses, columns, limits())
-    last = first_row(int(stamps[0]), poses[0], columns[0])
-    rows = [last]
-    for place in range(1, len(poses)):
-        here = slice(place, place + 1)
-        last = next_rows(last, stamps[here], poses[here], columns[here], limits())
-        rows.append(last)
-    for field, every in zip(whole._fields, zip(*rows, strict=True), strict=True):
-        np.testing.assert_array_equal(np.concatenate(every), getattr(whole, field), err_msg=field)
+    kept = Kept(limits(), 2)
+    for place, stamp in enumerate(stamps.tolist()):
+        kept.add(place, stamp, poses[place].tolist(), column_logarithms(columns[place]).tolist())
+    for field in ("stamps_ns", "part", "path_m"):
+        np.testing.assert_array_equal(getattr(kept, field), getattr(whole, field), err_msg=field)
+    for place in range(len(poses)):
+        for field in ("twist", "change"):
+            found = getattr(kept, field)(place)
+            np.testing.assert_array_equal(found, getattr(whole, field)[place], err_msg=field)
+        means = (whole.sums[place] - whole.sums[0]) / max(place, 1)
+        np.testing.assert_array_equal(kept.means(0, place), means)
     # A missing pose is a part of its own; a jump and a gap each begin a part.
     assert np.flatnonzero(np.diff(whole.part)).tolist() == [19, 20, 39, 49]
 
