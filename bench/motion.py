@@ -31,15 +31,17 @@ from cvo_edge import geometry
 from cvo_edge.motion.adaptation import MotionAdaptation
 from cvo_edge.motion.annotation import annotate
 from cvo_edge.motion.audit import RecordingAudit, audit
-from cvo_edge.motion.conformalize import conformalize, trace_of
+from cvo_edge.motion.conformalize import conformalize
 from cvo_edge.motion.corrections import fit_of
 from cvo_edge.motion.format import MotionFile, encode_motion_file
 from cvo_edge.motion.intervals import Level, MotionCalibration, MotionWindow
 from cvo_edge.motion.pairs import Pair
+from cvo_edge.motion.recordings import trace_of
 from cvo_edge.motion.relative import motion, norms, residual
 from cvo_edge.motion.thresholds import Scores
 from cvo_edge.motion.windows import window_errors
 from cvo_edge.programs.trajectories import Files, Reading, correct_pairs, fits, read_pairs
+from cvo_edge.spread import Here
 from cvo_edge.vocabulary import MOTION_RULES, MotionCorrection
 
 Array = NDArray[np.float64]
@@ -58,7 +60,7 @@ def kitti() -> list[Pair]:
         Files(path, folder / "groundtruth" / path.name)
         for path in sorted((folder / "estimate").glob("*.txt"))
     ]
-    return read_pairs(files, Reading(fps=9.65))
+    return read_pairs(files, Reading(fps=9.65)).pairs.collect()
 
 
 def euroc() -> list[Pair]:
@@ -68,7 +70,7 @@ def euroc() -> list[Pair]:
         for folder in sorted((DATA / "euroc_vio").iterdir())
         for run in (0, 1)
     ]
-    return read_pairs(files, Reading())
+    return read_pairs(files, Reading()).pairs.collect()
 
 
 SETS: dict[str, tuple[Any, tuple[MotionCorrection, ...]]] = {
@@ -80,7 +82,7 @@ SETS: dict[str, tuple[Any, tuple[MotionCorrection, ...]]] = {
 def alignments(pairs: Sequence[Pair]) -> list[dict[str, Any]]:
     """Return what the alignment report finds of each pair."""
     report = []
-    for pair, fit in zip(pairs, fits(pairs), strict=True):
+    for pair, fit in zip(pairs, fits(Here(pairs)), strict=True):
         found = fit.alignment
         report.append(
             {
@@ -155,7 +157,7 @@ def left_out(pairs: Sequence[Pair]) -> dict[str, Any]:
         others = [pair for pair in pairs if pair.group != drive]
         own = [pair for pair in pairs if pair.group == drive]
         fitted, plain = (
-            MotionCalibration(conformalize(others, "bench", learned=learned))
+            MotionCalibration(conformalize(Here(others), "bench", learned=learned))
             for learned in (True, False)
         )
         for index, horizon in enumerate(fitted.horizons):
@@ -351,7 +353,7 @@ def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def costs(pairs: Sequence[Pair]) -> dict[str, Any]:
     """Return processor times and the size of the file."""
     start = time.process_time()
-    file: MotionFile = conformalize(pairs, "bench")
+    file: MotionFile = conformalize(Here(pairs), "bench")
     learned_s = time.process_time() - start
     calibration = MotionCalibration(file)
     start = time.process_time()
@@ -375,7 +377,8 @@ def main() -> None:
     for name in parser.parse_args().sets:
         read, wanted = SETS[name]
         pairs = read()
-        corrected, _ = correct_pairs(pairs, fits(pairs), wanted)
+        here = Here(pairs)
+        corrected = correct_pairs(here, fits(here), wanted)[0].collect()
         report = {
             "set": name,
             "corrected": list(wanted),

@@ -81,10 +81,14 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
     except Terminated:
         code = 128 + signal.SIGTERM
     except SystemExit as leaving:
+        # Ray replaces the exception that a signal raises while it waits.
+        if _terminated.is_set():
+            code = 128 + signal.SIGTERM
         # rich exits by itself if the reader of a help page has closed the pipe.
-        if not isinstance(leaving.__context__, BrokenPipeError):
+        elif isinstance(leaving.__context__, BrokenPipeError):
+            code = 0
+        else:
             raise
-        code = 0
     except MemoryError:
         code = _complain(program, "not enough memory for this command", 1)
     except Exception as error:

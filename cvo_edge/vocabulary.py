@@ -23,6 +23,7 @@ TrajectoryFormat = Literal["tum", "kitti", "euroc", "openvins"]
 MotionFormat = Literal["jsonl", "csv", "tum"]
 MotionCovariance = Literal["interval", "integrated"]
 MotionCorrection = Literal["time", "frame", "scale"]
+MotionEngine = Literal["local", "ray"]
 MotionRule = Literal["mean", "tolerance", "capped", "hierarchical"]
 SplitKind = Literal["random", "block", "sequence"]
 

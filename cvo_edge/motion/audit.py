@@ -10,7 +10,6 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.motion.conformalize import trace_of
 from cvo_edge.motion.covariance import CHI_SQUARE, SPANS_S, nees, sums_of
 from cvo_edge.motion.drift import Running
 from cvo_edge.motion.intervals import (
@@ -21,6 +20,7 @@ from cvo_edge.motion.intervals import (
     MotionWindow,
 )
 from cvo_edge.motion.pairs import Pair
+from cvo_edge.motion.recordings import trace_of
 from cvo_edge.motion.relative import motion, norms, residual
 from cvo_edge.motion.trace import Rows
 from cvo_edge.motion.windows import window_errors

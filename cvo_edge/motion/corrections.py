@@ -48,9 +48,13 @@ class Effect(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What was found of a pair, and the effect of each correction after those before it."""
+    """What was found of a pair, and the effect of each correction after those before it.
+
+    ``period_s``: usual time between poses of the estimate.
+    """
 
     name: str
+    period_s: float
     alignment: Alignment
     effects: dict[MotionCorrection, Effect]
 
@@ -100,7 +104,7 @@ def fit_of(pair: Pair, alignment: Alignment) -> Fit:
         better = bool((after < _WORTH * before).any())
         effects[correction] = Effect(before, after, better and significant[correction])
         before = after
-    return Fit(pair.name, alignment, effects)
+    return Fit(pair.name, period_s, alignment, effects)
 
 
 def _turned(alignment: Alignment) -> bool:

@@ -23,6 +23,7 @@ carries errors along by x' = Ad(e^-1) x for each later step e.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from cvo_edge import geometry
 from cvo_edge.motion.relative import motion, residual
 from cvo_edge.motion.thresholds import Scores
 from cvo_edge.motion.trace import Rows
+from cvo_edge.spread import Spread
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -92,15 +94,27 @@ def nees(residuals: Array, covariance: Array) -> Array:
     return np.asarray(np.sum(residuals * solved, axis=1))
 
 
-def fit_shape(scaled: Sequence[Array], groups: Sequence[str]) -> Shape:
+def fit_shape(scaled: Spread[Array], groups: Sequence[str]) -> Shape:
     """Return the shape of residuals without bias, divided by their scales, (m, 6) each."""
-    spread = np.mean([_clipped(each).T @ _clipped(each) / len(each) for each in scaled], axis=0)
+    spread = np.mean(scaled.map(_clipped_moments).collect(), axis=0)
     # A degree of freedom that never errs, as of a planar robot, still needs a variance.
     deviation = np.sqrt(np.maximum(np.diag(spread), _LEAST))
     matrix = spread + _RIDGE * np.diag(deviation**2)
-    whole = [nees(each, np.broadcast_to(matrix, (len(each), 6, 6))) for each in scaled]
-    q = Scores([each[:, np.newaxis] for each in whole], groups).thresholds("mean", LEVEL)
+    whole = scaled.map(partial(_nees_of, matrix=matrix)).collect()
+    q = Scores(whole, groups).thresholds("mean", LEVEL)
     return Shape(matrix * float(q[0]) / CHI_SQUARE)
+
+
+def _nees_of(residuals: Array, matrix: Array) -> Array:
+    """Return NEES (n, 1) of residuals (n, 6) with one covariance (6, 6)."""
+    solved = np.linalg.solve(matrix, residuals.T)
+    return np.asarray(np.sum(residuals.T * solved, axis=0))[:, np.newaxis]
+
+
+def _clipped_moments(values: Array) -> Array:
+    """Return the second moments (6, 6) of values (m, 6) without outliers."""
+    clipped = _clipped(values)
+    return np.asarray(clipped.T @ clipped / len(values))
 
 
 def _clipped(values: Array) -> Array:

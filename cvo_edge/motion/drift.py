@@ -15,7 +15,7 @@ most 1 / (G + 1).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 
 from cvo_edge.motion.errors import recent_rows
 from cvo_edge.motion.kept import Kept
+from cvo_edge.motion.recordings import Recording
 from cvo_edge.motion.trace import RECENT, Rows, logarithms, recent_numbers
+from cvo_edge.spread import Spread
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -90,20 +92,28 @@ def _whole_second(rows: Rows, recent: Integers, ends: Integers) -> NDArray[np.bo
     return np.asarray(seconds >= _NEARLY * RECENT.value)
 
 
-def fit_familiar(traces: Sequence[Rows], period_s: float) -> Familiar:
+def fit_familiar(recordings: Spread[Recording], period_s: float) -> Familiar:
     """Return mean, spread and limit of calibrated drives; drives count equally."""
-    every = []
-    for rows in traces:
-        ends = np.arange(len(rows.part))
-        recent = recent_rows(rows, ends)
-        ends = ends[_whole_second(rows, recent, ends)]
-        every.append(recent_numbers(rows, recent[ends], ends))
-    mean = np.mean([each.mean(axis=0) for each in every], axis=0)
-    square = np.mean([((each - mean) ** 2).mean(axis=0) for each in every], axis=0)
+    mean = np.mean(recordings.map(_moments).collect(), axis=0)
+    square = np.mean(recordings.map(partial(_moments, about=mean)).collect(), axis=0)
     open_ended = Familiar(mean, np.maximum(np.sqrt(square), _LEAST), np.inf)
-    largest = 0.0
-    for rows in traces:
-        novelty = open_ended.novelty(rows, np.arange(len(rows.part)))
-        running = Running(period_s).all(novelty, rows.part)
-        largest = max(largest, *(value for value in running if value is not None))
-    return open_ended._replace(limit=largest)
+    largest = recordings.map(partial(_largest, familiar=open_ended, period_s=period_s)).collect()
+    return open_ended._replace(limit=max(largest))
+
+
+def _moments(recording: Recording, about: Array | None = None) -> Array:
+    """Return the mean of the numbers (k,), or that of their squares about another one."""
+    rows = recording.rows
+    ends = np.arange(len(rows.part))
+    recent = recent_rows(rows, ends)
+    ends = ends[_whole_second(rows, recent, ends)]
+    numbers = recent_numbers(rows, recent[ends], ends)
+    return np.asarray((numbers if about is None else (numbers - about) ** 2).mean(axis=0))
+
+
+def _largest(recording: Recording, familiar: Familiar, period_s: float) -> float:
+    """Return the largest D of a recording; zero if no second is whole."""
+    rows = recording.rows
+    novelty = familiar.novelty(rows, np.arange(len(rows.part)))
+    running = Running(period_s).all(novelty, rows.part)
+    return max((value for value in running if value is not None), default=0.0)

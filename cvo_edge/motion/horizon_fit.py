@@ -7,8 +7,8 @@ recordings that its models have not seen; a simpler one unless another is 2 % na
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -28,6 +28,7 @@ from cvo_edge.motion.fitting import (
     solve_scale,
 )
 from cvo_edge.motion.thresholds import Scores
+from cvo_edge.spread import Spread
 
 Array = NDArray[np.float64]
 
@@ -47,132 +48,177 @@ class Fit(NamedTuple):
     bias: Array | None
     scale: Scale | None
 
-    def biases(self, errors: Errors) -> Array:
-        """Return b (m, 6)."""
-        if self.bias is None:
-            return np.zeros((len(errors.end), 6))
-        return predict_bias(self.bias, errors.numbers)
-
     def scales(self, errors: Errors) -> Array:
         """Return u (m, 8)."""
         if self.scale is None:
             return np.ones((len(errors.end), ERRORS))
         return predict_scale(self.scale, errors.sizes)
 
-    def scores(self, errors: Errors) -> Array:
+
+class Tried(NamedTuple):
+    """What the models that do not know a recording make of it.
+
+    Attributes
+    ----------
+    rests
+        Residuals (m, 6) without and with their bias taken off.
+    sizes
+        Scales (m, 8) for each of these; None if there are none.
+    """
+
+    rests: tuple[Array, ...]
+    sizes: tuple[Array, ...] | None
+
+    def rest(self, variant: Variant) -> Array:
+        """Return residuals (m, 6)."""
+        return self.rests[variant[0]]
+
+    def scales(self, variant: Variant) -> Array:
+        """Return scales (m, 8), or a one for all."""
+        return self.sizes[variant[0]] if self.sizes and variant[1] else _ONE
+
+    def scores(self, variant: Variant) -> Array:
         """Return |x - b| / u of the six degrees of freedom and the two norms, (m, 8)."""
-        return eight(errors.residuals - self.biases(errors)) / self.scales(errors)
+        return eight(self.rest(variant)) / self.scales(variant)
 
 
 class Crossed(NamedTuple):
-    """The fit that is kept, and scores (m, 8) of each recording by models fitted without it.
+    """The fit that is kept, and the scores of each recording by models fitted without it.
 
-    ``scaled``: the residuals behind the scores, without their bias and over their scales, (m, 6).
-
-    ``variants``: whether translation and rotation use bias and scale.
+    Attributes
+    ----------
+    fit
+        Bias and scale.
+    scaled
+        Of each recording, residuals over their scales, (m, 6), and scores (m, 8).
+    variants
+        Whether translation and rotation use bias and scale.
     """
 
     fit: Fit
-    scores: list[Array]
-    scaled: list[Array]
+    scaled: Spread[tuple[Array, Array]]
     variants: tuple[Variant, ...]
 
 
-class _Tried(NamedTuple):
-    """A variant: its fit on all recordings; of each, crossed scores, scales, scaled residuals."""
-
-    fit: Fit
-    scores: list[Array]
-    scales: list[Array]
-    scaled: list[Array]
+_ONE = np.ones((1, ERRORS))
 
 
-def fit_horizon(errors: Sequence[Errors], groups: Sequence[str], learned: bool) -> Crossed:
+class _Models(NamedTuple):
+    """Bias, and scale of errors without and with their bias taken off."""
+
+    bias: Array
+    scales: tuple[Scale, Scale]
+
+
+def fit_horizon(errors: Spread[Errors], groups: Sequence[str], learned: bool) -> Crossed:
     """Fit the recordings of several groups.
 
     ``learned`` False: without bias and scale, because there is too little to learn them from.
     """
+    if not learned:
+        plain = errors.map(_plain)
+        return Crossed(Fit(None, None), plain.map(_joined), (_VARIANTS[0],) * len(HALVES))
     names = sorted(set(groups))
     folds = [names.index(group) % FOLDS for group in groups]
-    tried = {
-        variant: _variant(errors, folds, *variant)
-        for variant in (_VARIANTS if learned else _VARIANTS[:1])
-    }
-    chosen = tuple(_choice(tried, list(half), groups) for half in HALVES)
-    return _joined(chosen, tried)
-
-
-def _variant(errors: Sequence[Errors], folds: Sequence[int], biased: bool, scaled: bool) -> _Tried:
-    rests = [each.residuals for each in errors]
-    bias, scale = None, None
-    if biased:
-        of_fold, bias = _crossed(
-            [bias_sums(each.numbers, each.residuals) for each in errors], folds, solve_bias
+    biases, plain_sums = zip(*errors.map(_first_sums).collect(), strict=True)
+    of_fold, bias = _crossed(biases, folds, solve_bias)
+    own = [of_fold[fold] for fold in folds]
+    rest_sums = errors.map(_second_sums, own).collect()
+    crossed = [_crossed(sums, folds, solve_scale) for sums in (plain_sums, rest_sums)]
+    without = [
+        _Models(each, (plain, rest))
+        for each, plain, rest in zip(of_fold, crossed[0][0], crossed[1][0], strict=True)
+    ]
+    tried = errors.map(_tried, [without[fold] for fold in folds])
+    thresholds = [
+        Scores(tried.map(partial(Tried.scores, variant=each)).collect(), groups).thresholds(
+            "mean", _LEVEL
         )
-        rests = [
-            each.residuals - predict_bias(of_fold[fold], each.numbers)
-            for each, fold in zip(errors, folds, strict=True)
-        ]
-    scales = [np.ones((len(each.end), ERRORS)) for each in errors]
-    if scaled:
-        sums = [scale_sums(each.sizes, rest) for each, rest in zip(errors, rests, strict=True)]
-        by_fold, scale = _crossed(sums, folds, solve_scale)
-        scales = [
-            predict_scale(by_fold[fold], each.sizes)
-            for each, fold in zip(errors, folds, strict=True)
-        ]
-    scores = [eight(rest) / size for rest, size in zip(rests, scales, strict=True)]
-    scaled_rests = [rest / size[:, :6] for rest, size in zip(rests, scales, strict=True)]
-    return _Tried(Fit(bias, scale), scores, scales, scaled_rests)
+        for each in _VARIANTS
+    ]
+    costs = np.mean(tried.map(partial(_costs, thresholds=thresholds)).collect(), axis=0)
+    chosen = tuple(_choice(costs[:, half]) for half in HALVES)
+    whole = _Models(bias, (crossed[0][1], crossed[1][1]))
+    return Crossed(_kept(whole, chosen), tried.map(partial(_joined, chosen=chosen)), chosen)
+
+
+def _first_sums(errors: Errors) -> tuple[Normal, Normal]:
+    """Return the sums of the bias, and those of the scale of errors with their bias."""
+    return bias_sums(errors.numbers, errors.residuals), scale_sums(errors.sizes, errors.residuals)
+
+
+def _second_sums(errors: Errors, bias: Array) -> Normal:
+    """Return the sums of the scale of errors without their bias."""
+    return scale_sums(errors.sizes, errors.residuals - predict_bias(bias, errors.numbers))
+
+
+def _plain(errors: Errors) -> Tried:
+    return Tried((errors.residuals,), None)
+
+
+def _tried(errors: Errors, models: _Models) -> Tried:
+    rest = errors.residuals - predict_bias(models.bias, errors.numbers)
+    plain, without = (predict_scale(each, errors.sizes) for each in models.scales)
+    return Tried((errors.residuals, rest), (plain, without))
+
+
+def _costs(tried: Tried, thresholds: Sequence[Array]) -> Array:
+    """Return the mean interval score of each variant's crossed intervals, (variants, 8)."""
+    penalty = 1.0 / (1.0 - _LEVEL)
+    costs = []
+    for variant, q in zip(_VARIANTS, thresholds, strict=True):
+        over = np.maximum(tried.scores(variant) - q, 0.0)
+        costs.append(np.mean(tried.scales(variant) * (q + penalty * over), axis=0))
+    return np.array(costs)
+
+
+def _choice(costs: Array) -> Variant:
+    """Return the first variant that is hardly worse than the best one, by costs (variants, k).
+
+    Columns count by their geometric mean.
+    """
+    means = np.exp(np.mean(np.log(np.maximum(costs, 1e-12)), axis=1))
+    return _VARIANTS[int(np.argmax(_WORTH * means <= means.min()))]
+
+
+def _joined(
+    tried: Tried, chosen: Sequence[Variant] = (_VARIANTS[0], _VARIANTS[0])
+) -> tuple[Array, Array]:
+    """Return scaled residuals (m, 6) and scores (m, 8), each half by its variant."""
+    rests = [tried.rest(each) / tried.scales(each)[:, :6] for each in chosen]
+    scores = [tried.scores(each) for each in chosen]
+    own = np.isin(np.arange(ERRORS), HALVES[0])
+    return np.where(own[:6], *rests), np.where(own, *scores)
 
 
 def _crossed(
     sums: Sequence[Normal], folds: Sequence[int], solve: Callable[[Normal], Model]
 ) -> tuple[list[Model], Model]:
     """Return what is fitted without each fold, and what is fitted on all."""
+    count = max(folds) + 1
+    of_fold = [
+        reduce(Normal.plus, [each for each, own in zip(sums, folds, strict=True) if own == fold])
+        for fold in range(count)
+    ]
     without = [
-        solve(reduce(Normal.plus, [s for s, of in zip(sums, folds, strict=True) if of != fold]))
-        for fold in range(max(folds) + 1)
+        solve(reduce(Normal.plus, [each for other, each in enumerate(of_fold) if other != fold]))
+        for fold in range(count)
     ]
-    return without, solve(reduce(Normal.plus, sums))
+    return without, solve(reduce(Normal.plus, of_fold))
 
 
-def _choice(tried: Mapping[Variant, _Tried], columns: list[int], groups: Sequence[str]) -> Variant:
-    """Return the first variant that is hardly worse than the best one, in some columns."""
-    costs = {variant: _cost(each, columns, groups) for variant, each in tried.items()}
-    best = min(costs.values())
-    return next(variant for variant, cost in costs.items() if _WORTH * cost <= best)
-
-
-def _cost(tried: _Tried, columns: list[int], groups: Sequence[str]) -> float:
-    """Return the geometric mean over columns of the mean interval score of crossed intervals."""
-    scores = [each[:, columns] for each in tried.scores]
-    q = Scores(scores, groups).thresholds("mean", _LEVEL)
-    penalty = 1.0 / (1.0 - _LEVEL)
-    costs = [
-        np.mean(size[:, columns] * (q + penalty * np.maximum(score - q, 0.0)), axis=0)
-        for score, size in zip(scores, tried.scales, strict=True)
-    ]
-    return float(np.exp(np.mean(np.log(np.maximum(np.mean(costs, axis=0), 1e-12)))))
-
-
-def _joined(chosen: tuple[Variant, ...], tried: Mapping[Variant, _Tried]) -> Crossed:
-    """Return what is used of each half's variant; zero coefficients for what is not."""
-    first = next(iter(tried.values()))
-    scores, scaled = ([each.copy() for each in kind] for kind in (first.scores, first.scaled))
+def _kept(models: _Models, chosen: Sequence[Variant]) -> Fit:
+    """Return what is used of models of all recordings; zero coefficients for what is not."""
     bias: Array | None = None
     scale: Scale | None = None
-    for half, variant in zip(HALVES, chosen, strict=True):
-        columns, own = list(half), tried[variant]
-        for joined, each in zip(scores, own.scores, strict=True):
-            joined[:, columns] = each[:, columns]
-        for joined, each in zip(scaled, own.scaled, strict=True):
-            joined[:, columns[:3]] = each[:, columns[:3]]
-        if own.fit.bias is not None:
-            bias = np.zeros_like(own.fit.bias) if bias is None else bias
-            bias[:, columns[:3]] = own.fit.bias[:, columns[:3]]
-        if own.fit.scale is not None:
-            plain = np.zeros_like(own.fit.scale.coefficients)
-            scale = own.fit.scale._replace(coefficients=plain) if scale is None else scale
-            scale.coefficients[:, columns] = own.fit.scale.coefficients[:, columns]
-    return Crossed(Fit(bias, scale), scores, scaled, chosen)
+    for half, (biased, scaled) in zip(HALVES, chosen, strict=True):
+        columns = list(half)
+        if biased:
+            bias = np.zeros_like(models.bias) if bias is None else bias
+            bias[:, columns[:3]] = models.bias[:, columns[:3]]
+        if scaled:
+            own = models.scales[biased]
+            if scale is None:
+                scale = own._replace(coefficients=np.zeros_like(own.coefficients))
+            scale.coefficients[:, columns] = own.coefficients[:, columns]
+    return Fit(bias, scale)

@@ -15,6 +15,7 @@ and the tube is narrower where it is wide. Thresholds on the score follow as for
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from cvo_edge.motion.horizons import Horizon
 from cvo_edge.motion.relative import motion, norms, residual
 from cvo_edge.motion.thresholds import Scores
 from cvo_edge.motion.trace import Rows
+from cvo_edge.spread import Spread
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -80,27 +82,35 @@ def window_errors(rows: Rows, truth: Array, window: Horizon) -> Window:
     return Window(anchor, (along[end] - along[start])[fine], norms(off[fine]))
 
 
+def anchors_of(window: Window) -> int:
+    """Return the number of anchors."""
+    return int(window.anchor[-1]) + 1 if len(window.anchor) else 0
+
+
 def knots_of(window: Horizon) -> Array:
     """Return the places (KNOTS,) of a window's profile, close together near the anchor."""
     return window.value * np.linspace(0.0, 1.0, KNOTS + 1)[1:] ** 2
 
 
-def profile_of(window: Horizon, recordings: Sequence[Window], groups: Sequence[str]) -> Array:
+def profile_of(window: Horizon, recordings: Spread[Window], groups: Sequence[str]) -> Array:
     """Return the profile (KNOTS, 2) of position and rotation, ascending."""
     knots = knots_of(window)
     edges = np.concatenate([[0.0], 0.5 * (knots[1:] + knots[:-1]), [np.inf]])
     profile = np.zeros((KNOTS, 2))
     for index in range(KNOTS):
-        near = [
-            each.errors[(edges[index] < each.along) & (each.along <= edges[index + 1])]
-            for each in recordings
-        ]
+        between = partial(_between, low=float(edges[index]), high=float(edges[index + 1]))
+        near = recordings.map(between).collect()
         used = [place for place, each in enumerate(near) if len(each)]
         if used:
             scores = Scores([near[place] for place in used], [groups[place] for place in used])
             profile[index] = scores.thresholds("mean", _LEVEL)
     raised = np.maximum.accumulate(profile, axis=0) * (knots / window.value)[:, None] ** -_RAISED
     return np.maximum(np.maximum.accumulate(raised, axis=0), _LEAST)
+
+
+def _between(window: Window, low: float, high: float) -> Array:
+    """Return the errors (m, 2) at distances from an anchor above ``low`` and up to ``high``."""
+    return window.errors[(low < window.along) & (window.along <= high)]
 
 
 def radii(knots: Array, profile: Array, along: Array) -> Array:

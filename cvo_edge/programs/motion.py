@@ -11,7 +11,14 @@ import typer
 from cvo_edge.errors import GateError, UsageError
 from cvo_edge.files import refuse_overwriting, write_text
 from cvo_edge.programs.options import INTERVALS, REPORT, JsonFileOption
-from cvo_edge.vocabulary import MotionCovariance, MotionFormat, MotionRule, Scope, TrajectoryFormat
+from cvo_edge.vocabulary import (
+    MotionCovariance,
+    MotionEngine,
+    MotionFormat,
+    MotionRule,
+    Scope,
+    TrajectoryFormat,
+)
 
 if TYPE_CHECKING:
     from cvo_edge.motion.horizons import Horizon
@@ -35,7 +42,7 @@ PairsOption = Annotated[
     Path | None,
     typer.Option(
         "--pairs",
-        help="More pairs: lines EST GT [GROUP [TIMES]], relative to this file.",
+        help="More pairs: lines EST GT [GROUP [TIMES]], relative to this file; quote spaces.",
         readable=False,
         show_default=False,
         rich_help_panel=_INPUT,
@@ -146,19 +153,17 @@ def conformalize(
         ),
     ] = "auto",
     correct: CorrectOption = None,
+    engine: Annotated[
+        MotionEngine,
+        typer.Option(
+            help="local: in this process; ray: on a Ray cluster (extra ray), for many recordings. "
+            "All its machines need the files at the same paths."
+        ),
+    ] = "local",
 ) -> None:
     """Learn intervals on an estimator's motion from trajectories with ground truth."""
-    from cvo_edge.motion.conformalize import conformalize as learn
-    from cvo_edge.motion.format import encode_motion_file
-    from cvo_edge.programs.motion_report import calibration_lines, fit_lines
-    from cvo_edge.programs.trajectories import (
-        Reading,
-        correct_pairs,
-        fits,
-        listed_files,
-        read_pairs,
-        wanted_corrections,
-    )
+    from cvo_edge.programs.conformalize import Wanted, calibrate
+    from cvo_edge.programs.trajectories import Reading, listed_files, wanted_corrections
 
     wanted = wanted_corrections(correct)
     horizons = _horizons("--horizon", horizon)
@@ -173,25 +178,13 @@ def conformalize(
     given = listed_files(files or [], pairs, group or [])
     read = [path for each in given for path in each.paths]
     refuse_overwriting(output, *read, pairs, times)
-    found = read_pairs(given, Reading(format, times, fps))
-    fitted = fits(found)
-    corrected, correction = correct_pairs(found, fitted, wanted)
-    file = learn(
-        corrected,
-        name,
-        horizons,
-        windows,
-        learned=scale != "none",
-        columns=columns,
-        correction=correction,
+    calibrate(
+        given,
+        Reading(format, times, fps),
+        Wanted(name, horizons, windows, scale != "none", columns, wanted),
+        output,
+        engine,
     )
-    content = encode_motion_file(file)
-    # Before the report: whoever reads that may close the pipe.
-    write_text(output, content.decode())
-    if output != "-":
-        print(*fit_lines(found, fitted, wanted), sep="\n")
-        print(*calibration_lines(file), sep="\n")
-        print(f"-> {output}, {len(content)} bytes")
 
 
 def _columns(scale: str) -> list[str]:
@@ -354,9 +347,10 @@ def audit(
     for written in (json_file, picture):
         if written is not None:
             refuse_overwriting(str(written), *read, motion, pairs, times)
-    found = read_pairs(named, Reading(format, times, fps))
+    pairs_read = read_pairs(named, Reading(format, times, fps)).pairs
     if wanted:
-        found, _ = correct_pairs(found, fits(found), wanted)
+        pairs_read, _ = correct_pairs(pairs_read, fits(pairs_read), wanted)
+    found = pairs_read.collect()
     report = compare(calibration, level, found)
     failure = None
     if min_coverage is not None:

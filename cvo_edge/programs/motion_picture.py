@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from cvo_edge.errors import UsageError
 from cvo_edge.files import whole_file
 from cvo_edge.motion.audit import Audit, scaled
-from cvo_edge.motion.conformalize import trace_of
 from cvo_edge.motion.intervals import Level, MotionCalibration, MotionWindow
 from cvo_edge.motion.pairs import Pair
+from cvo_edge.motion.recordings import trace_of
 from cvo_edge.motion.relative import motion, norms, residual, rotated
 from cvo_edge.motion.trace import Rows
 

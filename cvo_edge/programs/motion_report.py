@@ -12,19 +12,45 @@ from cvo_edge.motion.audit import Audit, HorizonAudit, NeesAudit
 from cvo_edge.motion.corrections import Fit
 from cvo_edge.motion.format import MotionFile
 from cvo_edge.motion.intervals import Level, MotionCalibration
-from cvo_edge.motion.pairs import Pair
 from cvo_edge.programs.trajectories import MOST_SPREAD
-from cvo_edge.vocabulary import MOTION_RULES, MotionCorrection
+from cvo_edge.vocabulary import MOTION_CORRECTIONS, MOTION_RULES, MotionCorrection
 
 _AXES = "xyz"
 # What is left over of rotations and translations of files that do not belong together, of cars or
 # with quaternions in another order; of estimators seen so far, at most 0.12 and 0.07.
 _DOUBT = (0.3, 0.1)
+# More pairs than this are reported by their spread, and with so many that stand out.
+_MOST_LINES, _MOST_ODD = 30, 10
 
 
-def fit_lines(pairs: Sequence[Pair], fits: Sequence[Fit], made: Sequence[str]) -> Iterator[str]:
-    """Yield the alignment report: one line a pair, then what is worth correcting."""
-    width = max(len("recording"), *(len(fit.name) for fit in fits))
+def fit_lines(fits: Sequence[Fit], made: Sequence[str]) -> Iterator[str]:
+    """Yield the alignment report: one line a pair, then what is worth correcting.
+
+    Of many pairs: their spread, and those that stand out.
+    """
+    if len(fits) <= _MOST_LINES:
+        yield from _pair_lines(fits)
+    else:
+        yield from _spread_lines(fits)
+        if odd := sorted((each for each in fits if _stands_out(each)), key=_gain):
+            yield f"{len(odd)} of {len(fits)} stand out; most of all:"
+            yield from _pair_lines(odd[:_MOST_ODD])
+    doubted = [fit for fit in fits if _doubtful(fit)]
+    for fit in doubted[:_MOST_ODD]:
+        rotation, translation = fit.alignment.misfit.tolist()
+        yield (
+            f"doubt: {printable(fit.name)}: {rotation:.0%} of rotations and {translation:.0%} "
+            "of translations do not fit the truth; check the pair, stamps and the quaternions' "
+            "order (qx qy qz qw)"
+        )
+    if len(doubted) > _MOST_ODD:
+        yield f"doubt: {len(doubted) - _MOST_ODD} more like these"
+    for correction in MOTION_CORRECTIONS:
+        yield from _worth(fits, correction, correction in made)
+
+
+def _pair_lines(fits: Sequence[Fit]) -> Iterator[str]:
+    width = max(len("recording"), *(len(printable(fit.name)) for fit in fits))
     yield (
         f"{'recording':<{width}}  {'truth - estimate':>16}  {'body frame, deg (x y z)':>26}  "
         f"{'scale':>14}  undetermined"
@@ -38,16 +64,45 @@ def fit_lines(pairs: Sequence[Pair], fits: Sequence[Fit], made: Sequence[str]) -
             f"{1e3 * found.offset_s:7.1f} +-{1e3 * found.offset_error_s:4.1f} ms  "
             f"{turn:>26}  {found.scale:.4f}+-{found.scale_error:.4f}  {lost}"
         )
-    for fit in fits:
-        rotation, translation = fit.alignment.misfit.tolist()
-        if rotation > _DOUBT[0] and translation > _DOUBT[1]:
-            yield (
-                f"doubt: {printable(fit.name)}: {rotation:.0%} of rotations and {translation:.0%} "
-                "of translations do not fit the truth; check the pair, stamps and the quaternions' "
-                "order (qx qy qz qw)"
-            )
-    for correction in ("time", "frame", "scale"):
-        yield from _worth(pairs, fits, correction, correction in made)
+
+
+def _spread_lines(fits: Sequence[Fit]) -> Iterator[str]:
+    """Yield least, median and largest value of what was found, with the names of both ends."""
+    found = [each.alignment for each in fits]
+    rows = {
+        "truth - estimate, ms": [1e3 * each.offset_s for each in found],
+        "body frames differ by, deg": [
+            math.degrees(float(np.linalg.norm(each.determined_rotation))) for each in found
+        ],
+        "scale": [each.scale for each in found],
+        "left over of rotations, %": [100.0 * float(each.misfit[0]) for each in found],
+        "left over of translations, %": [100.0 * float(each.misfit[1]) for each in found],
+    }
+    yield f"{f'{len(fits)} recordings':<30}{'least':>9}{'median':>9}{'largest':>9}"
+    for name, values in rows.items():
+        ends = (printable(fits[int(place(values))].name) for place in (np.argmin, np.argmax))
+        numbers = "".join(f"{of(values):>9.4g}" for of in (min, np.median, max))
+        yield f"{name:<30}{numbers}  {' .. '.join(ends)}"
+    if lost := sum(len(each.undetermined) > 0 for each in found):
+        yield f"an axis is undetermined in {lost} of {len(fits)}"
+
+
+def _doubtful(fit: Fit) -> bool:
+    return bool((fit.alignment.misfit > _DOUBT).all())
+
+
+def _stands_out(fit: Fit) -> bool:
+    return _doubtful(fit) or any(effect.worth for effect in fit.effects.values())
+
+
+def _gain(fit: Fit) -> float:
+    """Return the least share of an error that corrections would leave."""
+    shares = [
+        np.nanmin(each.after / np.maximum(each.before, 1e-12), initial=1.0)
+        for each in fit.effects.values()
+        if each.worth
+    ]
+    return float(min(shares, default=1.0))
 
 
 def _axis(axis: np.ndarray) -> str:
@@ -58,16 +113,12 @@ def _axis(axis: np.ndarray) -> str:
     return "(" + " ".join(f"{value:.2f}" for value in axis) + ")"
 
 
-def _worth(
-    pairs: Sequence[Pair], fits: Sequence[Fit], correction: MotionCorrection, made: bool
-) -> Iterator[str]:
-    found = [
-        (pair, fit) for pair, fit in zip(pairs, fits, strict=True) if fit.effects[correction].worth
-    ]
+def _worth(fits: Sequence[Fit], correction: MotionCorrection, made: bool) -> Iterator[str]:
+    found = [fit for fit in fits if fit.effects[correction].worth]
     if not found:
         return
-    before = np.median([fit.effects[correction].before for _, fit in found], axis=0)
-    after = np.median([fit.effects[correction].after for _, fit in found], axis=0)
+    before = np.median([fit.effects[correction].before for fit in found], axis=0)
+    after = np.median([fit.effects[correction].after for fit in found], axis=0)
     changes = "; ".join(
         f"over {name} {100 * b[0]:.3g} -> {100 * a[0]:.3g} cm, "
         f"{math.degrees(b[1]):.3g} -> {math.degrees(a[1]):.3g} deg"
@@ -87,18 +138,16 @@ def _worth(
         yield f"  not corrected; --correct {correction} does that"
 
 
-def _what(found: Sequence[tuple[Pair, Fit]], correction: MotionCorrection) -> str:
+def _what(found: Sequence[Fit], correction: MotionCorrection) -> str:
     if correction == "time":
-        offsets = [fit.alignment.offset_s for _, fit in found]
-        period_s = float(
-            np.median([1e-9 * np.median(np.diff(pair.stamps_ns)) for pair, _ in found])
-        )
+        offsets = [fit.alignment.offset_s for fit in found]
+        period_s = float(np.median([fit.period_s for fit in found]))
         middle = float(np.median(offsets))
         return f"stamps differ by {middle:.3f} s ({abs(middle) / period_s:.1f} frames)"
     if correction == "frame":
-        turns = [np.linalg.norm(fit.alignment.determined_rotation) for _, fit in found]
+        turns = [np.linalg.norm(fit.alignment.determined_rotation) for fit in found]
         return f"body frames differ by {math.degrees(float(np.median(turns))):.2f} deg"
-    scales = [fit.alignment.scale for _, fit in found]
+    scales = [fit.alignment.scale for fit in found]
     return f"the scale differs ({min(scales):.3f} .. {max(scales):.3f})"
 
 

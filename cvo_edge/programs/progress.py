@@ -1,4 +1,4 @@
-"""A progress line on the terminal: frames, rate, time left and statuses."""
+"""A progress line on the terminal: how much is done, and the time left."""
 
 from __future__ import annotations
 
@@ -18,8 +18,41 @@ _WIDTH = 80
 _CLEAR = "\r\x1b[K"
 
 
-class FramesProgress:
-    """Progress line that is rewritten at most ten times per second; other calls return quickly.
+class _Line:
+    """A line on a terminal that is rewritten at most ten times per second."""
+
+    def __init__(self, stream: TextIO, clock: Callable[[], float]) -> None:
+        self._stream, self._clock = stream, clock
+        self._begin = clock()
+        self._next = self._begin + _SECONDS_BETWEEN_UPDATES
+        self._shown = False
+
+    def close(self) -> None:
+        """Erase the line."""
+        if self._shown:
+            self._put(_CLEAR)
+
+    def _due(self, now: float) -> bool:
+        if now < self._next:
+            return False
+        self._next = now + _SECONDS_BETWEEN_UPDATES
+        return True
+
+    def _show(self, text: str) -> None:
+        self._put(_CLEAR + text[: _columns(self._stream) - 1])
+        self._shown = True
+
+    def _put(self, text: str) -> None:
+        # Losing the terminal must not end the run.
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except (OSError, ValueError):
+            self._next = float("inf")
+
+
+class FramesProgress(_Line):
+    """Progress of a stream: frames, rate, time left and statuses; most calls return quickly.
 
     Parameters
     ----------
@@ -40,18 +73,14 @@ class FramesProgress:
         total: int | None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._stream, self._summary, self._total, self._clock = stream, summary, total, clock
-        self._begin = clock()
-        self._next = self._begin + _SECONDS_BETWEEN_UPDATES
-        self._shown = False
+        super().__init__(stream, clock)
+        self._summary, self._total = summary, total
 
     def tick(self) -> None:
         """Update the line if it is due; call this once per frame."""
         now = self._clock()
-        if now >= self._next:
-            self._next = now + _SECONDS_BETWEEN_UPDATES
-            self._put(_CLEAR + self.line(now)[: _columns(self._stream) - 1])
-            self._shown = True
+        if self._due(now):
+            self._show(self.line(now))
 
     def line(self, now: float) -> str:
         """Return the text at the time ``now``."""
@@ -69,18 +98,22 @@ class FramesProgress:
         parts += [f"{summary.statuses[s]} {s}" for s in Status if summary.statuses[s]]
         return "  ".join(parts)
 
-    def close(self) -> None:
-        """Erase the line."""
-        if self._shown:
-            self._put(_CLEAR)
 
-    def _put(self, text: str) -> None:
-        # Losing the terminal must not end the run.
-        try:
-            self._stream.write(text)
-            self._stream.flush()
-        except (OSError, ValueError):
-            self._next = float("inf")
+class ItemsProgress(_Line):
+    """Progress of work on recordings, one kind of work after another."""
+
+    def __init__(self, stream: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(stream, clock)
+        self._what = ""
+
+    def watch(self, what: str, done: int, total: int) -> None:
+        """Say that ``done`` of ``total`` items are done; the time left is that of this work."""
+        now = self._clock()
+        if what != self._what:
+            self._what, self._begin = what, now
+        if self._due(now):
+            left = _minutes((total - done) * (now - self._begin) / done)
+            self._show(f"{what}: {done} of {total} recordings  {left} left")
 
 
 @contextmanager
@@ -96,6 +129,20 @@ def frames_progress(
     progress = FramesProgress(stream, summary, min(known, default=None))
     try:
         yield progress.tick
+    finally:
+        progress.close()
+
+
+@contextmanager
+def items_progress() -> Iterator[Callable[[str, int, int], None] | None]:
+    """Yield what to tell of items that are done; None if stderr is not a terminal."""
+    stream = sys.stderr
+    if stream is None or not stream.isatty():
+        yield None
+        return
+    progress = ItemsProgress(stream)
+    try:
+        yield progress.watch
     finally:
         progress.close()
 

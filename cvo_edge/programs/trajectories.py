@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from hashlib import sha256
 from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
@@ -12,12 +16,13 @@ from typing import NamedTuple
 import numpy as np
 
 from cvo_edge import geometry
-from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.errors import SourceError, UsageError, printable
 from cvo_edge.motion.alignment import LEAST_MOTIONS, MOST_OFFSET_S, Alignment
 from cvo_edge.motion.corrections import Fit, corrected, fit_of
 from cvo_edge.motion.files import Poses, read_poses
 from cvo_edge.motion.format import CorrectionSpec
 from cvo_edge.motion.pairs import Pair, pair_of
+from cvo_edge.spread import Here, Spread
 from cvo_edge.trajectories.tables import read_text
 from cvo_edge.vocabulary import MOTION_CORRECTIONS, MotionCorrection, TrajectoryFormat
 
@@ -25,6 +30,8 @@ from cvo_edge.vocabulary import MOTION_CORRECTIONS, MotionCorrection, Trajectory
 MOST_SPREAD = 1.1
 # Of motions, what is left over in files that are the same, and in files of different drives.
 _SAME, _OTHER = 1e-3, 0.5
+# So many names stand in a line.
+MOST_NAMES = 5
 _FORM = "estimate truth [group [times]]"
 
 
@@ -81,33 +88,97 @@ def _listed(path: Path) -> list[Files]:
     """Read lines ``estimate truth [group [times]]``; paths are relative to the list's folder."""
     files = []
     for number, line in enumerate(read_text(path, _FORM).splitlines(), start=1):
-        words = line.split("#")[0].split()
+        try:
+            words = shlex.split(line, comments=True)
+        except ValueError:
+            words = [line]
         if not words:
             continue
-        if not 2 <= len(words) <= 4:
-            raise SourceError(f"{path}: expected {_FORM}, found {line[:80]!r} in line {number}")
+        if not 2 <= len(words) <= 4 or not all(words):
+            raise SourceError(
+                f"{path}: expected {_FORM}, names with spaces in quotes, found {line[:80]!r} in "
+                f"line {number}"
+            )
         group = words[2] if len(words) > 2 else None
         times = path.parent / words[3] if len(words) > 3 else None
         files.append(Files(path.parent / words[0], path.parent / words[1], group, times))
     return files
 
 
-def read_pairs(files: Sequence[Files], reading: Reading) -> list[Pair]:
-    """Read pairs. Estimates of one truth are one group, unless another is given.
+class ReadPairs(NamedTuple):
+    """Pairs, and lines on what was seen of their drives."""
+
+    pairs: Spread[Pair]
+    notes: list[str]
+
+
+def read_pairs(
+    files: Sequence[Files],
+    reading: Reading,
+    spread: Callable[[Sequence[Files]], Spread[Files]] = Here,
+) -> ReadPairs:
+    """Read pairs, in this process or where ``spread`` puts them.
+
+    Estimates of one truth, or of copies of it, are one group, unless others are given.
 
     Raises SourceError and UsageError.
     """
-    truths: dict[tuple[Path, Path | None], Poses] = {}
     names = _names([each.estimate for each in files])
+    pairs = spread(files).map(partial(_read, reading=reading, last={}), names, what="reading")
+    truths = pairs.map(_digest, what="reading").collect()
+    groups, notes = _groups(files, names, truths)
+    return ReadPairs(pairs.map(_grouped, groups), notes)
+
+
+def _read(
+    files: Files, name: str, reading: Reading, last: dict[tuple[Path, Path | None], Poses]
+) -> Pair:
+    """Read a pair without a group; ``last`` keeps one truth, which often serves several."""
+    key = (files.truth.resolve(), files.times)
+    if key not in last:
+        truth = reading.poses(files.truth, files.times)
+        last.clear()
+        last[key] = truth
+    return pair_of(name, "", reading.poses(files.estimate, files.times), last[key])
+
+
+def _grouped(pair: Pair, group: str) -> Pair:
+    return replace(pair, group=group)
+
+
+def _digest(pair: Pair) -> str:
+    return sha256(pair.track.poses.tobytes()).hexdigest()
+
+
+def _groups(
+    files: Sequence[Files], names: Sequence[str], truths: Sequence[str]
+) -> tuple[list[str], list[str]]:
+    """Return the group of each pair, and lines on truths of several files or groups."""
     drives = _names([each.truth.resolve() for each in files])
-    pairs = []
-    for each, name, drive in zip(files, names, drives, strict=True):
-        key = (each.truth.resolve(), each.times)
-        if key not in truths:
-            truths[key] = reading.poses(each.truth, each.times)
-        estimate = reading.poses(each.estimate, each.times)
-        pairs.append(pair_of(name, each.group or drive, estimate, truths[key]))
-    return pairs
+    alike: dict[str, list[int]] = {}
+    for place, truth in enumerate(truths):
+        alike.setdefault(truth, []).append(place)
+    groups, notes = [""] * len(files), []
+    for places in alike.values():
+        given = sorted({group for place in places if (group := files[place].group)})
+        own = given[0] if len(given) == 1 else min(drives[place] for place in places)
+        for place in places:
+            groups[place] = files[place].group or own
+        called = _listed_names([names[place] for place in places])
+        if len(given) > 1:
+            notes.append(
+                f"doubt: {called}: their truths have the same poses, but they count as drives "
+                f"{_listed_names(given)}"
+            )
+        elif len({drives[place] for place in places}) > 1:
+            notes.append(f"one drive: {called}: their truths have the same poses")
+    return groups, notes
+
+
+def _listed_names(names: Sequence[str]) -> str:
+    """Return a few names with commas."""
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(map(printable, names[:MOST_NAMES])) + more
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -123,29 +194,30 @@ def _alike(parts: Sequence[Sequence[str]]) -> int:
     return len(list(takewhile(lambda column: len(set(column)) == 1, zip(*parts, strict=False))))
 
 
-def fits(pairs: Sequence[Pair]) -> list[Fit]:
+def fits(pairs: Spread[Pair]) -> list[Fit]:
     """Compare the trajectories of each pair.
 
     Raises SourceError for a pair with too few motions, and for one in other units.
     """
-    found = []
-    for pair in pairs:
-        alignment = pair.aligned()
-        if alignment is None:
-            raise SourceError(
-                f"{pair.name}: expected at least {LEAST_MOTIONS} motions of half a second, or from "
-                "keyframe to keyframe, with a truth that moves, found fewer among "
-                f"{len(pair.stamps_ns)} poses"
-            )
-        _check_fit(pair, alignment)
-        fit = fit_of(pair, alignment)
-        if fit.unit is not None:
-            raise SourceError(
-                f"{pair.name}: expected metres in both files, found motions of the truth that are "
-                f"{alignment.scale:.4g} times the estimate's; convert one of them"
-            )
-        found.append(fit)
-    return found
+    return pairs.map(_fit, what="alignment").collect()
+
+
+def _fit(pair: Pair) -> Fit:
+    alignment = pair.aligned()
+    if alignment is None:
+        raise SourceError(
+            f"{pair.name}: expected at least {LEAST_MOTIONS} motions of half a second, or from "
+            "keyframe to keyframe, with a truth that moves, found fewer among "
+            f"{len(pair.stamps_ns)} poses"
+        )
+    _check_fit(pair, alignment)
+    fit = fit_of(pair, alignment)
+    if fit.unit is not None:
+        raise SourceError(
+            f"{pair.name}: expected metres in both files, found motions of the truth that are "
+            f"{alignment.scale:.4g} times the estimate's; convert one of them"
+        )
+    return fit
 
 
 def _check_fit(pair: Pair, alignment: Alignment) -> None:
@@ -182,8 +254,8 @@ def wanted_corrections(text: str | None) -> tuple[MotionCorrection, ...]:
 
 
 def correct_pairs(
-    pairs: Sequence[Pair], fits: Sequence[Fit], wanted: Sequence[MotionCorrection]
-) -> tuple[list[Pair], CorrectionSpec]:
+    pairs: Spread[Pair], fits: Sequence[Fit], wanted: Sequence[MotionCorrection]
+) -> tuple[Spread[Pair], CorrectionSpec]:
     """Return pairs with their own time and frame corrected, and with one scale for all.
 
     Raises UsageError for scales that differ by more than a tenth: no number corrects them.
@@ -198,10 +270,8 @@ def correct_pairs(
                 f".. {max(scales):.3f}; leave it out, or scale each file"
             )
         scale = float(f"{np.median(scales):.6g}")
-    own = [
-        corrected(pair, alignment, [each for each in wanted if each != "scale"], scale)
-        for pair, alignment in zip(pairs, alignments, strict=True)
-    ]
+    each_its_own = [each for each in wanted if each != "scale"]
+    own = pairs.map(partial(corrected, wanted=each_its_own, scale=scale), alignments)
     turns = np.array([geometry.quaternion_exp(each.determined_rotation) for each in alignments])
     turn = geometry.mean_rotation(turns).tolist() if "frame" in wanted else None
     offset_s = float(np.median([each.offset_s for each in alignments]))

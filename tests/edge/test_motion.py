@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from cvo_edge.conformal import capped_quantile
 from cvo_edge.errors import UsageError
-from cvo_edge.motion.conformalize import limits_of, trace_of
 from cvo_edge.motion.errors import errors_of
 from cvo_edge.motion.fitting import Normal, bias_sums, predict_bias, solve_bias
 from cvo_edge.motion.horizons import Horizon, starts
 from cvo_edge.motion.kept import Kept
+from cvo_edge.motion.recordings import about, limits_of, trace_of
 from cvo_edge.motion.relative import motion, norms, residual
 from cvo_edge.motion.thresholds import CAP, Scores
 from cvo_edge.motion.trace import Limits, column_logarithms, rows_of
@@ -188,7 +188,7 @@ def test_a_bias_that_is_linear_in_the_motion_is_found() -> None:
     bias = np.zeros((6, 6))
     bias[0, 0], bias[5, 1] = 0.3, -0.1
     pairs = [drive(seed, bias=bias) for seed in range(3)]
-    rows = [trace_of(pair, limits_of(pairs), ()) for pair in pairs]
+    rows = [trace_of(pair, limits_of(list(map(about, pairs))), ()) for pair in pairs]
     errors = [
         errors_of(row, pair.truth, Horizon("f", 1)) for row, pair in zip(rows, pairs, strict=True)
     ]

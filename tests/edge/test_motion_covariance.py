@@ -19,6 +19,7 @@ from cvo_edge.motion.covariance import (
 from cvo_edge.motion.horizons import Horizon
 from cvo_edge.motion.intervals import MotionCalibration
 from cvo_edge.motion.relative import residual
+from cvo_edge.spread import Here
 
 from .simulated_drives import composed, drive, twist
 
@@ -57,7 +58,7 @@ def test_a_shape_fits_normal_residuals() -> None:
     generator = np.random.default_rng(2)
     covariance = any_covariance(generator, 1.0)
     samples = [generator.multivariate_normal(np.zeros(6), covariance, 4000) for _ in range(4)]
-    shape = fit_shape(samples, "abcd")
+    shape = fit_shape(Here(samples), "abcd")
     np.testing.assert_allclose(shape.matrix, covariance, atol=0.1 * np.abs(covariance).max())
     scales = np.array([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]])
     found = Shape(covariance).covariance(scales)[0]
@@ -76,7 +77,7 @@ def test_the_quantile_is_chi_squares() -> None:
 def test_both_covariances_fit_drives_with_independent_steps() -> None:
     horizons = (Horizon.parse("1f"), Horizon.parse("1s"))
     pairs = [drive(60 + seed, 500) for seed in range(8)]
-    calibration = MotionCalibration(conformalize(pairs[:5], "test", horizons, []))
+    calibration = MotionCalibration(conformalize(Here(pairs[:5]), "test", horizons, []))
     report = audit(calibration, calibration.level(), pairs[5:])
     rows = [(*recording.horizons, *recording.integrated) for recording in report.recordings]
     for over in zip(*rows, strict=True):

@@ -24,6 +24,7 @@ from cvo_edge.motion.pairs import Pair
 from cvo_edge.motion.records import MotionHeader, MotionReason, MotionRecord
 from cvo_edge.motion.tracker import MotionTracker
 from cvo_edge.programs.cli import app
+from cvo_edge.spread import Here
 from cvo_edge.vocabulary import MOTION_RULES, MotionCovariance
 
 from .simulated_drives import drive
@@ -34,9 +35,8 @@ WINDOWS = (Horizon.parse("5s"),)
 
 @pytest.fixture(scope="module")
 def file() -> MotionFile:
-    return conformalize(
-        [drive(seed, noise=1.0 + seed % 3) for seed in range(6)], "test", HORIZONS, WINDOWS
-    )
+    drives = [drive(seed, noise=1.0 + seed % 3) for seed in range(6)]
+    return conformalize(Here(drives), "test", HORIZONS, WINDOWS)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_a_file_comes_back(file: MotionFile) -> None:
 
 def test_the_order_of_recordings_does_not_change_the_file(file: MotionFile) -> None:
     pairs = [drive(seed, noise=1.0 + seed % 3) for seed in reversed(range(6))]
-    again = conformalize(pairs, "test", HORIZONS, WINDOWS)
+    again = conformalize(Here(pairs), "test", HORIZONS, WINDOWS)
     assert encode_motion_file(again) == encode_motion_file(file)
 
 
@@ -183,7 +183,7 @@ def test_a_faster_robot_is_not_like_those_of_the_calibration(
 @pytest.fixture(scope="module")
 def plain() -> MotionCalibration:
     drives = [drive(80 + seed, 300) for seed in range(4)]
-    return MotionCalibration(conformalize(drives, "plain", HORIZONS[:2], [], learned=False))
+    return MotionCalibration(conformalize(Here(drives), "plain", HORIZONS[:2], [], learned=False))
 
 
 @pytest.mark.parametrize("delay", [0, 40, 150])
@@ -301,7 +301,7 @@ def test_a_planar_robot_that_stands_at_times_is_calibrated() -> None:
             poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
             poses[100:120] = poses[100]
         pairs.append(pair)
-    file = conformalize(pairs, "wheels", HORIZONS, WINDOWS)
+    file = conformalize(Here(pairs), "wheels", HORIZONS, WINDOWS)
     assert decode_motion_file(encode_motion_file(file)).horizons[0].horizon == "1f"
     report = audit(MotionCalibration(file), MotionCalibration(file).level(), pairs)
     assert report.calibrated_on == tuple(pair.name for pair in pairs)
@@ -313,7 +313,7 @@ def test_a_column_that_is_no_number_is_a_pose_that_is_missing() -> None:
     for pair in pairs:
         pair.columns["inliers"] = np.random.default_rng(0).uniform(20.0, 80.0, 201)
     calibration = MotionCalibration(
-        conformalize(pairs, "test", HORIZONS[:2], [], columns=["inliers"])
+        conformalize(Here(pairs), "test", HORIZONS[:2], [], columns=["inliers"])
     )
     values = pairs[0].columns["inliers"].copy()
     values[[50, 90]] = np.nan, np.inf
@@ -339,7 +339,7 @@ def test_intervals_hold_what_they_state() -> None:
     noise = np.random.default_rng(0).uniform(0.5, 2.0, 36)
     drives = [drive(100 + index, 200, each) for index, each in enumerate(noise)]
     calibration = MotionCalibration(
-        conformalize(drives[:18], "test", HORIZONS[:2], [Horizon.parse("2s")])
+        conformalize(Here(drives[:18]), "test", HORIZONS[:2], [Horizon.parse("2s")])
     )
     shares, tubes = {}, {}
     for rule in MOTION_RULES:

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from cvo_edge.cluster import ray_cluster
 from cvo_edge.errors import UsageError
+from cvo_edge.spread import OnRay
 from cvo_export.study.ray_engine import ray_engine
 
 pytest.importorskip("ray")
@@ -57,6 +59,12 @@ def die_once(path):
     path.write_text("twice")
 
 
+def square(number, other):
+    if number > 90:
+        raise UsageError(f"no {number}")
+    return number * other
+
+
 def test_outcomes_are_those_of_the_tasks_and_a_killed_worker_is_run_again(
     cluster, tmp_path, monkeypatch
 ):
@@ -81,6 +89,17 @@ def test_outcomes_are_those_of_the_tasks_and_a_killed_worker_is_run_again(
     assert type(found["refuse"]) is UsageError
     assert str(found["refuse"]) == "no"
     assert found["die"] is None
+    assert (tmp_path / "died").read_text() == "twice"
+    (tmp_path / "died").unlink()
+    told = []
+    with ray_cluster("test", "cvo-edge") as ray:
+        numbers = OnRay.of(ray, list(range(100)), lambda *words: told.append(words))
+        squares = numbers.take(range(80)).map(square, range(80), what="squares")
+        assert squares.collect() == [number**2 for number in range(80)]
+        assert told[-1] == ("squares", 80, 80)
+        with pytest.raises(UsageError, match="no 91"):
+            numbers.map(square, range(100)).map(str).collect()
+        OnRay.of(ray, [tmp_path / "died"]).map(die_once).collect()
     assert (tmp_path / "died").read_text() == "twice"
 
 
