@@ -28,6 +28,7 @@ from cvo_edge.vocabulary import MotionCovariance
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 # Poses whose records are made together, so that memory does not grow with the trajectory.
 _AT_ONCE = 1024
@@ -100,8 +101,7 @@ def _records(
 
     ``steps``: the horizon of covariances of steps; ``of_motions``: whether to add those of motions.
     """
-    seconds = 1e-9 * np.diff(rows.stamps_ns)
-    differs = len(seconds) > 0 and not calibration.same_rate(float(np.median(seconds)))
+    differs = calibration.other_rate(rows.stamps_ns)
     reasons = _reasons(calibration, rows, differs)
     running = Running(calibration.limits.period_s)
     limit = calibration.familiar.limit
@@ -112,9 +112,7 @@ def _records(
         novelty = running.all(calibration.familiar.novelty(rows, ends), rows.part[ends])
         shares = [None if value is None else value / limit for value in novelty]
         by_horizon = [
-            [none] * len(ends)
-            if differs and each.horizon.unit == "f"
-            else _motions(rows, ends, each, level, none, of_motions)
+            _motions(rows, ends, differs[ends], each, level, none, of_motions)
             for each, none in zip(calibration.horizons, nothing, strict=True)
         ]
         by_window = [
@@ -125,7 +123,7 @@ def _records(
         tubes = list(zip(*by_window, strict=True)) or [()] * len(ends)
         covariances: list[tuple[float, ...] | UnsetType | None] = [UNSET] * len(ends)
         if steps is not None:
-            covariances = _steps(calibration, steps, rows, ends, differs)
+            covariances = _steps(calibration, steps, rows, ends, differs[ends])
         for place, share in enumerate(shares):
             if share is not None and share > 1.0:
                 motions[place], tubes[place] = nothing, outside
@@ -151,17 +149,18 @@ _UNSET: Iterable[UnsetType] = repeat(UNSET)
 
 
 def _reasons(
-    calibration: MotionCalibration, rows: Rows, differs: bool
+    calibration: MotionCalibration, rows: Rows, differs: Mask
 ) -> list[tuple[MotionReason, ...]]:
     """Return the remarks on all rows."""
-    always = (MotionReason.RATE_DIFFERS,) if differs else ()
     missing = ~np.asarray(np.isfinite(rows.poses).all(axis=1))
     late = np.append(False, 1e-9 * np.diff(rows.stamps_ns) > calibration.limits.gap_s)
     late[1:] |= missing[:-1]
-    reasons: list[tuple[MotionReason, ...]] = [always] * len(rows.part)
-    reasons[0] = (MotionReason.TRAJECTORY_STARTED, *always)
+    reasons: list[tuple[MotionReason, ...]] = [()] * len(rows.part)
+    for row in np.flatnonzero(differs).tolist():
+        reasons[row] = (MotionReason.RATE_DIFFERS,)
+    reasons[0] = (MotionReason.TRAJECTORY_STARTED,)
     for row in (np.flatnonzero(np.diff(rows.part)) + 1).tolist():
-        reasons[row] = (MotionReason.GAP if late[row] else MotionReason.JUMP, *always)
+        reasons[row] = (MotionReason.GAP if late[row] else MotionReason.JUMP, *reasons[row])
     for row in np.flatnonzero(missing).tolist():
         reasons[row] = (MotionReason.POSE_MISSING,)
     return reasons
@@ -170,13 +169,15 @@ def _reasons(
 def _motions(
     rows: Rows,
     ends: Integers,
+    differs: Mask,
     horizon: MotionHorizon,
     level: Level,
     none: MotionInterval,
     covariance: bool,
 ) -> list[MotionInterval]:
     """Return the motions over one horizon that end at each of successive rows."""
-    found = horizon.intervals(rows, level, ends)
+    applies = ends if horizon.horizon.unit != "f" else ends[~differs]
+    found = horizon.intervals(rows, level, applies)
     bounded = np.isfinite(horizon.thresholds(level)).tolist()
     seconds = 1e-9 * (rows.stamps_ns[found.end] - rows.stamps_ns[found.start])
     metres = rows.path_m[found.end] - rows.path_m[found.start]
@@ -250,17 +251,16 @@ def _tube(
 
 
 def _steps(
-    calibration: MotionCalibration, steps: int, rows: Rows, ends: Integers, differs: bool
+    calibration: MotionCalibration, steps: int, rows: Rows, ends: Integers, differs: Mask
 ) -> list[tuple[float, ...] | UnsetType | None]:
     """Return the integrated covariance of the step that ends at each row; None without one."""
     every: list[tuple[float, ...] | UnsetType | None] = [None] * len(ends)
-    if not differs:
-        found = calibration.horizons[steps].intervals(rows, Level(), ends)
-        covariances = calibration.step_covariances(found.scale[:, :6]).reshape(-1, 36)
-        for place, each in zip(
-            (found.end - ends[0]).tolist(), map(tuple, covariances.tolist()), strict=True
-        ):
-            every[place] = each
+    found = calibration.horizons[steps].intervals(rows, Level(), ends[~differs])
+    covariances = map(
+        tuple, calibration.step_covariances(found.scale[:, :6]).reshape(-1, 36).tolist()
+    )
+    for place, each in zip((found.end - ends[0]).tolist(), covariances, strict=True):
+        every[place] = each
     return every
 
 

@@ -167,11 +167,15 @@ def _named(path: Path) -> list[str]:
     for line in read_text(path, _FORMS).splitlines():
         if line.strip() and not line.lstrip().startswith("#"):
             break
-        words = line.replace("timestamp(s)", "timestamp").lstrip(" #").split()
-        names = words if words[:1] == ["timestamp"] else names
+        names = tum_names(line) or names
+    return names if " ".join(names) != OPENVINS_FORM else []
+
+
+def tum_names(comment: str) -> list[str]:
+    """Return the names of all columns of a comment that names more than TUM's; else none."""
+    names = comment.replace("timestamp(s)", "timestamp").lstrip(" #").split()
     fixed = tum.FORM.split()
-    more = len(names) > len(fixed) and names[: len(fixed)] == fixed
-    return names if more and " ".join(names) != OPENVINS_FORM else []
+    return names if len(names) > len(fixed) and names[: len(fixed)] == fixed else []
 
 
 def _deviations(columns: dict[str, Array]) -> dict[str, Array]:

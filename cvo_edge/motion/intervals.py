@@ -24,6 +24,7 @@ from cvo_edge.motion.format import (
     symmetric,
 )
 from cvo_edge.motion.horizons import Horizon
+from cvo_edge.motion.rate import periods_s
 from cvo_edge.motion.trace import Limits, Rows, motion_numbers, scale_numbers
 from cvo_edge.motion.windows import Window, knots_of, radii, window_scores
 from cvo_edge.vocabulary import MOTION_RULES, SCOPES, MotionRule, Scope
@@ -269,6 +270,11 @@ class MotionCalibration:
     def same_rate(self, period_s: float) -> bool:
         """Whether poses come at the calibration's rate, which horizons in frames rely on."""
         return abs(period_s / self.limits.period_s - 1.0) <= SAME_RATE
+
+    def other_rate(self, stamps_ns: Integers) -> Mask:
+        """Return at which poses (n,) the rate is another one."""
+        off = np.abs(periods_s(stamps_ns) / self.limits.period_s - 1.0)
+        return np.concatenate([[False], off > SAME_RATE])
 
     def statement(self, level: Level) -> str:
         """Return in one sentence what intervals at a level promise."""

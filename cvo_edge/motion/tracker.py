@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from bisect import bisect_left, insort
-from collections import deque
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, get_args
 
@@ -24,6 +23,7 @@ from cvo_edge.motion.ending import Ending, Endings
 from cvo_edge.motion.fitting import ERRORS, eight
 from cvo_edge.motion.intervals import MotionCalibration
 from cvo_edge.motion.kept import KEPT, Kept, nanoseconds, seven
+from cvo_edge.motion.rate import Rate
 from cvo_edge.motion.records import (
     MotionInterval,
     MotionReason,
@@ -39,9 +39,6 @@ from cvo_edge.pose import Pose
 from cvo_edge.vocabulary import MotionCovariance, MotionRule, Scope
 
 Array = NDArray[np.float64]
-
-# The rate is the median of so many steps.
-_RATE_OF = 15
 
 
 class MotionUpdate(NamedTuple):
@@ -63,8 +60,8 @@ class MotionUpdate(NamedTuple):
 class MotionTracker:
     """Intervals on an estimator's motion as its poses come.
 
-    The records are those that ``annotate`` gives for the same poses, to the last bit, but for the
-    rate, which is not known before some poses have come. Not safe for use by several threads.
+    The records are those that ``annotate`` gives for the same poses, to the last bit. Not safe for
+    use by several threads.
 
     Parameters
     ----------
@@ -131,7 +128,7 @@ class MotionTracker:
         """Forget what came before."""
         self._kept = Kept(self.calibration.limits, len(self.calibration.file.columns))
         self._running = Running(self.calibration.limits.period_s)
-        self._rate = _Rate()
+        self._rate = Rate()
         self._truths: dict[int, Array] = {}
 
     def anchor(self, stamp_ns: int) -> None:
@@ -258,8 +255,10 @@ class MotionTracker:
 
     def _record(self, seq: int, stamp_ns: int, values: Sequence[float]) -> MotionRecord:
         calibration, kept = self.calibration, self._kept
-        period_s = self._rate.period_s(kept)
-        differs = period_s is not None and not calibration.same_rate(period_s)
+        differs = False
+        if len(kept) > 1:
+            period_s = self._rate.add(kept.stamps_ns[-1] - kept.stamps_ns[-2])
+            differs = not calibration.same_rate(period_s)
         reasons = self._reasons(differs)
         motion, since = self._nothing, self._outside
         step: tuple[float, ...] | UnsetType | None = UNSET if self._steps is None else None
@@ -363,22 +362,3 @@ class MotionTracker:
                 SinceAnchor(name, self._anchor_seq, seconds, metres, position, rotation, bounded)
             )
         return tuple(tubes)
-
-
-class _Rate:
-    """The time between poses: the median of the last steps."""
-
-    def __init__(self) -> None:
-        self._steps: deque[int] = deque()
-        self._sorted: list[int] = []
-
-    def period_s(self, kept: Kept) -> float | None:
-        """Take the last step of a stream and return seconds; None before enough have come."""
-        if len(kept) < 2:
-            return None
-        step = kept.stamps_ns[-1] - kept.stamps_ns[-2]
-        if len(self._steps) == _RATE_OF:
-            del self._sorted[bisect_left(self._sorted, self._steps.popleft())]
-        self._steps.append(step)
-        insort(self._sorted, step)
-        return 1e-9 * self._sorted[_RATE_OF // 2] if len(self._steps) == _RATE_OF else None

@@ -27,7 +27,7 @@ from cvo_edge.programs.cli import app
 from cvo_edge.spread import Here
 from cvo_edge.vocabulary import MOTION_RULES, MotionCovariance
 
-from .simulated_drives import drive
+from .simulated_drives import PERIOD_NS, drive
 
 HORIZONS = tuple(map(Horizon.parse, ("1f", "1s", "5m")))
 WINDOWS = (Horizon.parse("5s"),)
@@ -253,12 +253,21 @@ def test_a_tube_starts_at_its_anchor(calibration: MotionCalibration) -> None:
 
 
 def test_another_rate_ends_horizons_in_frames(calibration: MotionCalibration) -> None:
+    """As long as it lasts; a single frame that was dropped does not."""
     pair = drive(22, 200)
-    half = slice(None, None, 2)
-    level = calibration.level()
-    *_, record = annotate(calibration, level, pair.stamps_ns[half], pair.estimate[half], {})
-    assert record.reasons == (MotionReason.RATE_DIFFERS,)
-    assert [each.bounded for each in record.motion] == [False, True, True]
+    used = np.delete(np.arange(201), [20, *range(61, 141, 2)])
+    stamps, poses = pair.stamps_ns[used], pair.estimate[used]
+    records = list(annotate(calibration, calibration.level(), stamps, poses, {}))
+    differs = [MotionReason.RATE_DIFFERS in record.reasons for record in records]
+    assert [stamps[k] // PERIOD_NS for k in np.flatnonzero(np.diff(differs))] == [74, 147]
+    for record, other in zip(records[101:], differs[101:], strict=True):
+        assert [each.bounded for each in record.motion] == [not other, True, True]
+    tracker = MotionTracker(calibration)
+    assert [tracker.step(*each) for each in zip(stamps.tolist(), poses, strict=True)] == records
+    *_, record = annotate(
+        calibration, calibration.level(), pair.stamps_ns[:3], pair.estimate[[0, 2, 4]], {}
+    )
+    assert not record.reasons
 
 
 def test_wrong_poses_are_refused(calibration: MotionCalibration) -> None:
@@ -308,7 +317,7 @@ def test_a_planar_robot_that_stands_at_times_is_calibrated() -> None:
     assert all(np.isfinite(each.nees) for one in report.recordings for each in one.horizons)
 
 
-def test_a_column_that_is_no_number_is_a_pose_that_is_missing() -> None:
+def test_a_column_that_is_no_number_is_a_pose_that_is_missing(tmp_path: Path) -> None:
     pairs = [drive(210 + seed, 200) for seed in range(3)]
     for pair in pairs:
         pair.columns["inliers"] = np.random.default_rng(0).uniform(20.0, 80.0, 201)
@@ -332,6 +341,18 @@ def test_a_column_that_is_no_number_is_a_pose_that_is_missing() -> None:
         with pytest.raises(UsageError, match=r"^columns: expected numbers for inliers"):
             tracker.step(0, pairs[0].estimate[0], columns)
     assert tracker.step(1, None).status == Status.INVALID
+    # A comment before the first row names columns, in a file as in a pipe.
+    motion, estimate = tmp_path / "motion.json", tmp_path / "a.tum"
+    motion.write_bytes(encode_motion_file(calibration.file))
+    table = np.column_stack([1e-9 * pairs[0].stamps_ns, pairs[0].estimate, values])
+    np.savetxt(estimate, table, fmt="%.9f", header="timestamp tx ty tz qx qy qz qw inliers")
+    whole, piped = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
+    assert run("annotate", estimate, motion, "-o", whole)[0] == 0
+    words = ["annotate", "-", str(motion), "-o", str(piped)]
+    assert CliRunner().invoke(app, words, input=estimate.read_text()).exit_code == 0
+    assert piped.read_bytes() == whole.read_bytes()
+    refused = CliRunner().invoke(app, words, input=estimate.read_text().partition("\n")[2])
+    assert "found no column inliers" in str(refused.exception)
 
 
 def test_intervals_hold_what_they_state() -> None:
