@@ -19,6 +19,7 @@ degree, the rotation is undetermined.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +49,8 @@ LEAST_MOTIONS = 50
 _MOST_MOTIONS = 2000
 _MOST_COARSE = 400
 _LEAST_NOISE = 1e-9
+# So many offsets are looked at together.
+_AT_ONCE = 16
 # A body whose usual rotation (rad) and translation (m) in half a second are below these stands.
 _LEAST_MOTION = np.array([2e-3, 2e-3])
 
@@ -130,7 +133,7 @@ def align(stamps_ns: Integers, estimate: Array, truth: Track) -> Alignment | Non
     offset_ns = pair.coarse_offset()
     if offset_ns is None or pair.stands(offset_ns):
         return None
-    trues = [pair.truth_at(offset_ns + k * pair.step_ns) for k in (-1, 0, 1)]
+    trues = [pair.truth_at([offset_ns + k * pair.step_ns]) for k in (-1, 0, 1)]
     known = trues[0].known & trues[1].known & trues[2].known
     block = np.arange(len(known)) * _BLOCKS // len(known)
     vertices = [
@@ -142,7 +145,7 @@ def align(stamps_ns: Integers, estimate: Array, truth: Track) -> Alignment | Non
     found, *others = whole
     # At the vertex itself; those of the blocks only measure how much they differ.
     offset_ns += found.shift * pair.step_ns
-    true = pair.truth_at(offset_ns)
+    true = pair.truth_at([offset_ns])
     known = true.known
     best = _solve(pair.moved.taken(known), true.taken(known))
     turns = _logarithms(np.array([each.solution.R @ best.R.T for each in others]))
@@ -187,32 +190,37 @@ class _Pair:
         self.step_ns = of_truth_ns if of_truth_ns >= 0.5 * usual_ns else 0.25 * usual_ns
         self._bound_ns = round(max(20e6, 0.6 * of_truth_ns))
 
-    def truth_at(self, offset_ns: float, every: int = 1) -> _Twists:
-        """Return the truth's motions, NaN where it is not known."""
-        first, last = np.split(self._stamps_ns, 2)
-        both = np.concatenate([first[::every], last[::every]]) + round(offset_ns)
-        poses, _ = self._truth.poses_at(both, self._bound_ns)
+    def truth_at(self, offsets_ns: Sequence[float], every: int = 1) -> _Twists:
+        """Return the truth's motions at each offset in turn, NaN where it is not known."""
+        first, last = (each[::every] for each in np.split(self._stamps_ns, 2))
+        shifts = [round(offset) for offset in offsets_ns]
+        both = [stamps + shift for stamps in (first, last) for shift in shifts]
+        poses, _ = self._truth.poses_at(np.concatenate(both), self._bound_ns)
         return _twists(motion(*np.split(poses, 2)))
 
     def stands(self, offset_ns: float) -> bool:
         """Whether the truth neither turns nor moves."""
-        true = self.truth_at(offset_ns)
+        true = self.truth_at([offset_ns])
         usual = np.array([_rms(true.w[true.known]), _rms(true.t[true.known])])
         return bool((usual < _LEAST_MOTION).all())
 
     def coarse_offset(self) -> float | None:
         """Return the offset at which speeds and turn rates fit best; None if nothing does."""
         every = max(1, len(self.moved.w) // _MOST_COARSE)
-        few = _Twists(self.moved.w[::every], self.moved.t[::every])
+        own = _rates(_Twists(self.moved.w[::every], self.moved.t[::every]))
         count = round(1e9 * MOST_OFFSET_S / self.step_ns)
         offsets = [self.step_ns * k for k in range(-count, count + 1)]
-        costs = [_mismatch(few, self.truth_at(offset, every)) for offset in offsets]
+        costs = []
+        for first in range(0, len(offsets), _AT_ONCE):
+            some = offsets[first : first + _AT_ONCE]
+            rates = _rates(self.truth_at(some, every)).reshape(2, len(some), -1)
+            costs += [_mismatch(own, rates[:, place]) for place in range(len(some))]
         if not np.isfinite(costs).any():
             return None
         near = offsets[int(np.argmin(costs))]
         fine = {}
         for offset in (near + k * self.step_ns for k in range(-2, 3)):
-            true = self.truth_at(offset)
+            true = self.truth_at([offset])
             known = true.known
             if known.sum() >= LEAST_MOTIONS:
                 noise = _solve(self.moved.taken(known), true.taken(known)).noise
@@ -243,45 +251,53 @@ def _solve(moved: _Twists, true: _Twists) -> _Solution:
     """Return R, scale and noise on the motions that fit best, after a few steps."""
     R, scale, noise = np.eye(3), 1.0, np.ones(2)
     for step in range(_STEPS):
-        w, t = moved.w @ R.T, scale * moved.t @ R.T
-        off_w, off_t = true.w - w, true.t - t
-        fits = _fits(off_w) & _fits(off_t)
-        noise = np.maximum([_rms(off_w[fits]), _rms(off_t[fits])], _LEAST_NOISE)
+        turned = moved.w @ R.T, scale * (moved.t @ R.T)
+        off = true.w - turned[0], true.t - turned[1]
+        fits = np.flatnonzero(_fits(off[0]) & _fits(off[1]))
+        off = off[0][fits], off[1][fits]
+        noise = np.maximum([_rms(each) for each in off], _LEAST_NOISE)
+        own_t, true_t = moved.t[fits], true.t[fits]
         if step == 0:
             R = geometry.nearest_rotation(
-                true.w[fits].T @ moved.w[fits] / noise[0] ** 2
-                + true.t[fits].T @ moved.t[fits] / noise[1] ** 2
+                true.w[fits].T @ moved.w[fits] / noise[0] ** 2 + true_t.T @ own_t / noise[1] ** 2
             )
         else:
             information, pull = np.zeros((3, 3)), np.zeros(3)
-            for part, off, deviation in ((w, off_w, noise[0]), (t, off_t, noise[1])):
-                p, r = part[fits] / deviation, off[fits] / deviation
-                information += np.sum(p * p) * np.eye(3) - p.T @ p
-                pull += np.cross(p, r).sum(axis=0)
+            for part, rest, deviation in zip(turned, off, noise, strict=True):
+                p = part[fits]
+                gram, mixed = p.T @ p / deviation**2, p.T @ rest / deviation**2
+                information += np.trace(gram) * np.eye(3) - gram
+                # The sum of cross products p x r.
+                pull += (mixed - mixed.T)[(1, 2, 0), (2, 0, 1)]
             information += 1e-9 * np.trace(information) * np.eye(3) + 1e-300 * np.eye(3)
             turn = geometry.quaternion_exp(np.linalg.solve(information, pull))
             R = geometry.quaternion_to_matrix(turn) @ R
-        t = moved.t[fits] @ R.T
-        scale = float(np.sum(t * true.t[fits]) / max(np.sum(t * t), 1e-300))
+        scale = float(np.sum(R * (true_t.T @ own_t)) / max(np.sum(own_t * own_t), 1e-300))
     return _Solution(R, scale, noise)
 
 
 def _fits(off: Array) -> Mask:
-    size = np.linalg.norm(off, axis=1)
-    return np.asarray(size <= np.quantile(size, _KEPT))
+    size = np.einsum("ij,ij->i", off, off)
+    most = int(_KEPT * (len(size) - 1))
+    return np.asarray(size <= np.partition(size, most)[most])
 
 
-def _mismatch(moved: _Twists, true: _Twists) -> float:
-    """Return how much speeds and turn rates differ, as logarithms of their trimmed squares."""
-    known = true.known
+def _rates(twists: _Twists) -> Array:
+    """Return the sizes (2, n) of rotations and translations."""
+    return np.sqrt([np.einsum("ij,ij->i", each, each) for each in twists])
+
+
+def _mismatch(moved: Array, true: Array) -> float:
+    """Return how much sizes (2, n) differ, as logarithms of their trimmed squares."""
+    known = np.isfinite(true[0])
     if known.sum() < LEAST_MOTIONS:
         return np.inf
-    w = [np.linalg.norm(each.w[known], axis=1) for each in (moved, true)]
-    t = [np.linalg.norm(each.t[known], axis=1) for each in (moved, true)]
-    ratio = np.median(t[0]) / max(float(np.median(t[1])), 1e-12)
+    (w, t), (true_w, true_t) = moved[:, known], true[:, known]
+    ratio = np.median(t) / max(float(np.median(true_t)), 1e-12)
+    kept = int(_KEPT * len(w))
     return sum(
-        float(np.log(max(_rms(np.sort(np.abs(off))[: int(_KEPT * len(off))]), _LEAST_NOISE)))
-        for off in (w[0] - w[1], t[0] - ratio * t[1])
+        float(np.log(max(_rms(np.partition(np.abs(off), kept)[:kept]), _LEAST_NOISE)))
+        for off in (w - true_w, t - ratio * true_t)
     )
 
 

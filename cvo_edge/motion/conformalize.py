@@ -199,9 +199,11 @@ def _horizon(
     errors = measured.take(used)
     apart = sum(lengths[index] for index in used) / horizon.value
     crossed = fit_horizon(errors, own, learned and apart >= _LEAST_APART)
-    scores = Scores(crossed.scaled.map(_scores).collect(), own)
-    unit = np.maximum(scores.thresholds("mean", _JOINT_LEVEL)[:6], 1e-9)
+    scores = Scores(crossed.scaled.map(_scores).collect(), own).table(MOTION_RULES, LEVELS)
+    unit = scores[MOTION_RULES.index("mean"), LEVELS.index(_JOINT_LEVEL), :6]
+    unit = np.maximum(unit, 1e-9)
     joint = Scores(crossed.scaled.map(partial(_joint, unit=unit)).collect(), own)
+    q = np.concatenate([scores, joint.table(MOTION_RULES, LEVELS)], axis=2)
     bias, scale = crossed.fit
     shape = fit_shape(crossed.scaled.map(_residuals), own).matrix
     usual = np.mean(errors.map(partial(_usual, fit=crossed.fit)).collect(), axis=0)
@@ -222,10 +224,9 @@ def _horizon(
         shape=tuple(_rounded(value, _EXACT) for value in shape[np.tril_indices(6)].tolist()),
         usual=_numbers(usual),
         thresholds=tuple(
-            ThresholdSpec(rule=rule, confidence=level, q=_thresholds(np.concatenate(q)))
-            for rule in MOTION_RULES
-            for level in LEVELS
-            for q in [[each.thresholds(rule, level) for each in (scores, joint)]]
+            ThresholdSpec(rule=rule, confidence=level, q=_thresholds(each))
+            for rule, row in zip(MOTION_RULES, q, strict=True)
+            for level, each in zip(LEVELS, row, strict=True)
         ),
     )
 
@@ -318,9 +319,9 @@ def _window(
         rotation=rotation,
         thresholds=tuple(
             TubeThresholdSpec(rule=rule, confidence=level, q=(q[0], q[1]))
-            for rule in MOTION_RULES
-            for level in LEVELS
-            for q in [_thresholds(scores.thresholds(rule, level))]
+            for rule, row in zip(MOTION_RULES, scores.table(MOTION_RULES, LEVELS), strict=True)
+            for level, each in zip(LEVELS, row, strict=True)
+            for q in [_thresholds(each)]
         ),
     )
 

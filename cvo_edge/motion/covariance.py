@@ -45,6 +45,8 @@ SPANS_S = (1.0, 2.0, 5.0, 10.0)
 # Of all calibration recordings together; anchors of one are evenly apart.
 MOST_ANCHORS = 1200
 _ROUNDS = 25
+# So many anchors' steps are in memory at once.
+_AT_ONCE = 64
 _STEP = 0.7
 # Squares are clipped at so many times the predicted variance: outliers decide on no variance.
 _CLIP = 16.0
@@ -152,22 +154,27 @@ def sums_of(
     usual = float(np.median(np.diff(rows.stamps_ns)))
     lengths = [max(1, round(1e9 * span / usual)) for span in spans_s]
     anchors = np.arange(0, len(rows.part) - lengths[-1] - 1, apart)
-    carried = np.zeros((len(anchors), 6, 6, 6))
-    own = np.arange(6)
-    found = []
-    for length in range(1, lengths[-1] + 1):
-        end = anchors + length
-        step = np.nan_to_num(motion(rows.poses[end - 1], rows.poses[end]))
-        A = adjoint(step)[:, np.newaxis]
-        carried = A @ carried @ np.swapaxes(A, -1, -2)
-        carried[:, own, own, own] += scales[end] ** 2
-        if length in lengths:
-            off = residual(
-                motion(rows.poses[anchors], rows.poses[end]), motion(truth[anchors], truth[end])
-            )
-            fine = np.isfinite(off).all(axis=1) & (rows.part[anchors] == rows.part[end])
-            found.append(Sums(carried[fine], off[fine]))
-    return found
+    found: list[list[Sums]] = [[] for _ in lengths]
+    for first in range(0, max(1, len(anchors)), _AT_ONCE):
+        start = anchors[first : first + _AT_ONCE]
+        later = start[:, np.newaxis] + np.arange(1, lengths[-1] + 1)
+        # Variances of all steps, in the anchor's frame: first those up to the shortest time.
+        back = motion(rows.poses[later], rows.poses[start][:, np.newaxis])
+        columns = adjoint(back.reshape(-1, 7)).reshape(*later.shape, 6, 6)
+        columns = np.ascontiguousarray(
+            (columns * scales[later][:, :, np.newaxis]).transpose(0, 3, 2, 1)
+        )
+        variances, before = np.zeros((len(start), 6, 6, 6)), 0
+        for sums, length in zip(found, lengths, strict=True):
+            steps = columns[..., before:length]
+            variances, before = variances + steps @ np.swapaxes(steps, -1, -2), length
+            end = start + length
+            moved = motion(rows.poses[start], rows.poses[end])
+            off = residual(moved, motion(truth[start], truth[end]))
+            fine = np.isfinite(off).all(axis=1) & (rows.part[start] == rows.part[end])
+            A = adjoint(moved[fine])[:, np.newaxis]
+            sums.append(Sums(A @ variances[fine] @ np.swapaxes(A, -1, -2), off[fine]))
+    return [Sums(*map(np.concatenate, zip(*sums, strict=True))) for sums in found]
 
 
 def fit_factors(recordings: Sequence[Sequence[Sums]], groups: Sequence[str]) -> Array:

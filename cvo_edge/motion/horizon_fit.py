@@ -62,16 +62,15 @@ class Tried(NamedTuple):
     ----------
     rests
         Residuals (m, 6) without and with their bias taken off.
+    eights
+        Sizes (m, 8) of these: of the six degrees of freedom, and the two norms.
     sizes
-        Scales (m, 8) for each of these; None if there are none.
+        Scales (m, 8) for each of them; None if there are none.
     """
 
     rests: tuple[Array, ...]
+    eights: tuple[Array, ...]
     sizes: tuple[Array, ...] | None
-
-    def rest(self, variant: Variant) -> Array:
-        """Return residuals (m, 6)."""
-        return self.rests[variant[0]]
 
     def scales(self, variant: Variant) -> Array:
         """Return scales (m, 8), or a one for all."""
@@ -79,7 +78,7 @@ class Tried(NamedTuple):
 
     def scores(self, variant: Variant) -> Array:
         """Return |x - b| / u of the six degrees of freedom and the two norms, (m, 8)."""
-        return eight(self.rest(variant)) / self.scales(variant)
+        return self.eights[variant[0]] / self.scales(variant)
 
 
 class Crossed(NamedTuple):
@@ -153,13 +152,14 @@ def _second_sums(errors: Errors, bias: Array) -> Normal:
 
 
 def _plain(errors: Errors) -> Tried:
-    return Tried((errors.residuals,), None)
+    return Tried((errors.residuals,), (eight(errors.residuals),), None)
 
 
 def _tried(errors: Errors, models: _Models) -> Tried:
     rest = errors.residuals - predict_bias(models.bias, errors.numbers)
     plain, without = (predict_scale(each, errors.sizes) for each in models.scales)
-    return Tried((errors.residuals, rest), (plain, without))
+    rests = errors.residuals, rest
+    return Tried(rests, (eight(rests[0]), eight(rest)), (plain, without))
 
 
 def _costs(tried: Tried, thresholds: Sequence[Array]) -> Array:
@@ -185,10 +185,12 @@ def _joined(
     tried: Tried, chosen: Sequence[Variant] = (_VARIANTS[0], _VARIANTS[0])
 ) -> tuple[Array, Array]:
     """Return scaled residuals (m, 6) and scores (m, 8), each half by its variant."""
-    rests = [tried.rest(each) / tried.scales(each)[:, :6] for each in chosen]
-    scores = [tried.scores(each) for each in chosen]
-    own = np.isin(np.arange(ERRORS), HALVES[0])
-    return np.where(own[:6], *rests), np.where(own, *scores)
+    scaled, scores = np.empty_like(tried.rests[0]), np.empty_like(tried.eights[0])
+    for half, variant in zip(HALVES, chosen, strict=True):
+        columns, sizes = list(half), tried.scales(variant)
+        scores[:, columns] = tried.eights[variant[0]][:, columns] / sizes[:, columns]
+        scaled[:, columns[:3]] = tried.rests[variant[0]][:, columns[:3]] / sizes[:, columns[:3]]
+    return scaled, scores
 
 
 def _crossed(

@@ -33,12 +33,14 @@ Array = NDArray[np.float64]
 
 CAP = 0.5
 _TOLERANCE = 1e-9
+# Size of a sample, and how many of its values to both sides of a quantile are looked at first.
+_SAMPLE, _MARGIN = 1000, 30
 
 
 class Scores:
-    """The scores of several recordings, (n, columns) each, sorted once for all levels and rules.
+    """The scores of several recordings, (n, columns) each; ``groups`` says which are one.
 
-    ``groups`` says which recordings are one.
+    Columns are worked on one after another: those of many recordings fill the memory.
     """
 
     def __init__(self, scores: Sequence[Array], groups: Sequence[str]) -> None:
@@ -46,37 +48,74 @@ class Scores:
         for group, values in zip(groups, scores, strict=True):
             named.setdefault(group, []).append(values)
         # Sorted by name: sums of floats depend on the order.
-        parts = [np.concatenate(named[name]).T for name in sorted(named)]
-        self.count = len(parts)
-        self._own = [np.sort(part, axis=1) for part in parts]
-        every = np.concatenate(self._own, axis=1)
-        weight = np.concatenate([np.full(part.shape[1], 1.0 / part.shape[1]) for part in parts])
-        # Runs that are sorted already are merged, which is faster than to sort them.
-        order = np.argsort(every, axis=1, kind="stable")
-        self._sorted = np.take_along_axis(every, order, axis=1)
-        self._within = np.cumsum(weight[order], axis=1)
+        self._groups = [named[name] for name in sorted(named)]
+        self._sizes = [sum(map(len, each)) for each in self._groups]
+        self.count = len(self._groups)
 
     def thresholds(self, rule: MotionRule, confidence: float) -> Array:
         """Return a threshold for each column, (columns,); infinite if the rule supports none."""
-        if rule == "tolerance":
-            return np.asarray(np.max([_quantile(own, confidence) for own in self._own], axis=0))
-        count = self.count
-        if rule == "mean":
-            return self._least(confidence * count)
-        cap = CAP if rule == "capped" else 1.0
-        return self._least(confidence * (count + 1) - (1.0 - cap))
+        return np.asarray(self.table((rule,), (confidence,))[0, 0])
 
-    def _least(self, within: float) -> Array:
-        """Return the least scores up to which the recordings' shares add up to ``within``."""
-        found = np.full(len(self._sorted), math.inf)
-        for column, (values, shares) in enumerate(zip(self._sorted, self._within, strict=True)):
-            index = int(np.searchsorted(shares, within - _TOLERANCE * self.count))
-            if index < len(values):
-                found[column] = values[index]
+    def table(self, rules: Sequence[MotionRule], levels: Sequence[float]) -> Array:
+        """Return the thresholds of several rules and confidences, (rules, levels, columns)."""
+        weights = np.repeat([1.0 / size for size in self._sizes], self._sizes)
+        found = np.empty((len(rules), len(levels), self._groups[0][0].shape[1]))
+        single = len(rules) * len(levels) == 1 and rules[0] != "tolerance"
+        for column in range(found.shape[2]):
+            own = [np.concatenate([each[:, column] for each in group]) for group in self._groups]
+            if single:
+                within = self._within(rules[0], levels[0])
+                found[0, 0, column] = _selected(np.concatenate(own), weights, within)
+                continue
+            for each in own:
+                each.sort()
+            every = np.concatenate(own)
+            # Runs that are sorted already are merged, which is faster than to sort them.
+            order = np.argsort(every, kind="stable")
+            shares = np.cumsum(weights[order])
+            for row, rule in enumerate(rules):
+                for place, level in enumerate(levels):
+                    if rule == "tolerance":
+                        found[row, place, column] = max(_quantile(each, level) for each in own)
+                        continue
+                    index = int(np.searchsorted(shares, self._within(rule, level)))
+                    inside = index < len(every)
+                    found[row, place, column] = every[order[index]] if inside else math.inf
         return found
 
+    def _within(self, rule: MotionRule, confidence: float) -> float:
+        """Return what the shares of recordings up to the threshold have to add up to."""
+        wanted = confidence * self.count
+        if rule != "mean":
+            wanted = confidence * (self.count + 1) - (1.0 - (CAP if rule == "capped" else 1.0))
+        return wanted - _TOLERANCE * self.count
 
-def _quantile(ascending: Array, confidence: float) -> Array:
-    """Return the least scores (columns,) that at least this share of (columns, n) are up to."""
-    n = ascending.shape[1]
-    return ascending[:, max(0, math.ceil(confidence * n - _TOLERANCE * n) - 1)]
+
+def _quantile(ascending: Array, confidence: float) -> float:
+    """Return the least score that at least this share of scores (n,) are up to."""
+    n = len(ascending)
+    return float(ascending[max(0, math.ceil(confidence * n - _TOLERANCE * n) - 1)])
+
+
+def _selected(values: Array, weights: Array, within: float) -> float:
+    """Return the least value up to which the weights of values (n,) add up to ``within``.
+
+    A sample says between which values it is; only those are sorted. (Floyd and Rivest 1975)
+    """
+    step = 1 + len(values) // _SAMPLE
+    order = np.argsort(values[::step])
+    sample, shares = values[::step][order], np.cumsum(weights[::step][order])
+    place = int(np.searchsorted(shares, within * shares[-1] / weights.sum()))
+    margin = _MARGIN
+    while True:
+        low = sample[place - margin] if place >= margin else -math.inf
+        high = sample[place + margin] if place + margin < len(sample) else math.inf
+        below = float(weights @ (values <= low))
+        inside = np.flatnonzero((values > low) & (values <= high))
+        inside = inside[np.argsort(values[inside])]
+        index = int(np.searchsorted(below + np.cumsum(weights[inside]), within))
+        if below < within and index < len(inside):
+            return float(values[inside[index]])
+        if math.isinf(low) and math.isinf(high):
+            return math.inf
+        margin *= 4

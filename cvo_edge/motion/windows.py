@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.motion.horizons import Horizon
-from cvo_edge.motion.relative import motion, norms, residual
+from cvo_edge.motion.relative import between
 from cvo_edge.motion.thresholds import Scores
 from cvo_edge.motion.trace import Rows
 from cvo_edge.spread import Spread
@@ -36,6 +36,8 @@ _ANCHORS = 20
 _RAISED = 0.2
 _LEVEL = 0.9
 _LEAST = 1e-9
+# So many motions are in the processor's cache at once.
+_AT_ONCE = 4096
 
 
 class Window(NamedTuple):
@@ -76,10 +78,25 @@ def window_errors(rows: Rows, truth: Array, window: Horizon) -> Window:
     steps = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 1
     start = np.repeat(first, counts)
     end = start + steps
-    off = residual(motion(rows.poses[start], rows.poses[end]), motion(truth[start], truth[end]))
-    fine = np.isfinite(off).all(axis=1) & (along[end] - along[start] <= window.value)
+    errors = _sizes(rows.poses, truth, start, end)
+    fine = np.isfinite(errors).all(axis=1) & (along[end] - along[start] <= window.value)
     _, anchor = np.unique(anchor[fine], return_inverse=True)
-    return Window(anchor, (along[end] - along[start])[fine], norms(off[fine]))
+    return Window(anchor, (along[end] - along[start])[fine], errors[fine])
+
+
+def _sizes(estimate: Array, truth: Array, start: Integers, end: Integers) -> Array:
+    """Return position error and angle (m, 2) of motions between poses (n, 7), NaN if unknown."""
+    found = np.empty((len(start), 2))
+    own, true = np.ascontiguousarray(estimate.T), np.ascontiguousarray(truth.T)
+    for first in range(0, len(start), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        a, b = start[some], end[some]
+        x, y, z, p, q, r, s = between(
+            between(own[:, a], own[:, b]), between(true[:, a], true[:, b])
+        )
+        found[some, 0] = np.sqrt(x * x + y * y + z * z)
+        found[some, 1] = 2.0 * np.arctan2(np.sqrt(p * p + q * q + r * r), np.abs(s))
+    return found
 
 
 def anchors_of(window: Window) -> int:
