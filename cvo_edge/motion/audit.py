@@ -27,6 +27,7 @@ from cvo_edge.motion.windows import window_errors
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 _MOST_ANCHORS = 300
 
@@ -78,13 +79,20 @@ class WindowAudit(Struct, frozen=True):
 class RecordingAudit(Struct, frozen=True):
     """One recording.
 
-    ``withheld``: share of poses without intervals because the motion is unlike any calibrated one;
-    figures of horizons leave them out.
+    Figures count what is stated, as ``annotate`` does.
+
+    Attributes
+    ----------
+    withheld
+        Share of poses without intervals because the motion is unlike any calibrated one.
+    other_rate
+        Share of poses at another rate, without horizons in frames and covariances of steps.
     """
 
     name: str
     group: str
     withheld: float
+    other_rate: float
     horizons: tuple[HorizonAudit, ...]
     windows: tuple[WindowAudit, ...]
     integrated: tuple[NeesAudit, ...]
@@ -147,23 +155,30 @@ def audit(calibration: MotionCalibration, level: Level, pairs: Sequence[Pair]) -
         rows = trace_of(scaled(calibration, pair), calibration.limits, calibration.file.columns)
         if _known(calibration, rows):
             known.append(pair.name)
-        truth = pair.truth
-        differs = not calibration.same_rate(1e-9 * float(np.median(np.diff(pair.stamps_ns))))
+        truth, differs = pair.truth, calibration.other_rate(rows.stamps_ns)
         given = _given(calibration, rows)
+        ends = np.flatnonzero(given)
+        in_frames = np.flatnonzero(given & ~differs)
         horizons = [
-            _horizon(each, each.intervals(rows, level, given), truth)
+            _horizon(
+                each,
+                each.intervals(rows, level, in_frames if each.horizon.unit == "f" else ends),
+                truth,
+            )
             for each in calibration.horizons
-            if not (differs and each.horizon.unit == "f")
         ]
-        windows = [_window(each, rows, truth, level) for each in calibration.windows]
+        # A tube is stated at the poses of the window that have one.
+        stated = np.where(given[:, np.newaxis], truth, np.nan)
+        windows = [_window(each, rows, stated, level) for each in calibration.windows]
         recordings.append(
             RecordingAudit(
                 pair.name,
                 pair.group,
-                1.0 - len(given) / len(rows.part),
+                float(1.0 - given.mean()),
+                float(differs.mean()),
                 tuple(horizons),
                 tuple(windows),
-                tuple(_integrated(calibration, rows, truth)),
+                tuple(_integrated(calibration, rows, truth, in_frames)),
             )
         )
     if not any(each.motions for one in recordings for each in one.horizons):
@@ -191,13 +206,13 @@ def scaled(calibration: MotionCalibration, pair: Pair) -> Pair:
     return replace(pair, estimate=calibration.scaled(pair.estimate))
 
 
-def _given(calibration: MotionCalibration, rows: Rows) -> Integers:
-    """Return the rows whose motion is like that of calibrated drives."""
+def _given(calibration: MotionCalibration, rows: Rows) -> Mask:
+    """Return at which rows the motion is like that of calibrated drives."""
     ends = np.arange(len(rows.part))
     novelty = calibration.familiar.novelty(rows, ends)
     running = Running(calibration.limits.period_s).all(novelty, rows.part)
     limit = calibration.familiar.limit
-    return ends[[value is None or value <= limit for value in running]]
+    return np.array([value is None or value <= limit for value in running])
 
 
 def _known(calibration: MotionCalibration, rows: Rows) -> bool:
@@ -218,17 +233,25 @@ def _window(window: MotionWindow, rows: Rows, truth: Array, level: Level) -> Win
     return WindowAudit(window.spec.window, len(inside), position, rotation)
 
 
-def _integrated(calibration: MotionCalibration, rows: Rows, truth: Array) -> Iterator[NeesAudit]:
+def _integrated(
+    calibration: MotionCalibration, rows: Rows, truth: Array, ends: Integers
+) -> Iterator[NeesAudit]:
+    """Yield the NEES of sums of steps; ``ends``: rows at which a step's covariance is stated."""
     factors = calibration.file.integrated
     if factors is None:
         return
-    steps = next(each for each in calibration.horizons if each.spec.horizon == "1f")
-    scales = steps.step_scales(rows)
+    found = calibration.horizons[calibration.steps].intervals(rows, Level(), ends)
+    scales = np.ones((len(rows.part), 6))
+    scales[found.end] = found.scale[:, :6]
+    # No sum goes over a step without a covariance.
+    unknown = np.ones(len(rows.part), np.int64)
+    unknown[found.end] = 0
+    whole = rows._replace(part=rows.part + np.cumsum(unknown))
     apart = max(1, len(rows.part) // _MOST_ANCHORS)
-    for span_s, sums in zip(SPANS_S, sums_of(rows, truth, scales, SPANS_S, apart), strict=True):
+    for span_s, sums in zip(SPANS_S, sums_of(whole, truth, scales, SPANS_S, apart), strict=True):
         if len(sums.residuals):
-            found = nees(sums.residuals, sums.covariance(np.array(factors)))
-            yield NeesAudit(span_s, len(found), *_nees(found))
+            found_nees = nees(sums.residuals, sums.covariance(np.array(factors)))
+            yield NeesAudit(span_s, len(found_nees), *_nees(found_nees))
 
 
 def _nees(values: Array) -> tuple[float, float]:

@@ -60,6 +60,8 @@ class Poses(NamedTuple):
         Shape (n,) each: other columns by name.
     skipped
         What the file holds without giving a pose, as text.
+    timed
+        Whether the stamps were given, as the file has none.
     """
 
     path: Path
@@ -67,6 +69,7 @@ class Poses(NamedTuple):
     poses: Array
     columns: dict[str, Array]
     skipped: str
+    timed: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +103,8 @@ class PoseFile:
         Raises SourceError if the list does not fit, and UsageError if none is given.
         """
         stamps = self._stamps(times, fps)
-        return Poses(self.path, stamps, self.poses, self.columns, self.skipped)
+        timed = self.own_stamps_ns is None
+        return Poses(self.path, stamps, self.poses, self.columns, self.skipped, timed)
 
     def _stamps(self, times: Path | None, fps: float | None) -> Integers:
         if self.own_stamps_ns is not None:

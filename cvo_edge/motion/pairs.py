@@ -42,6 +42,8 @@ class Pair:
     offset_ns, turn
         Added to the estimate's stamps to look the truth up; quaternion (4,) from the estimate's
         body frame to the truth's. Zero and None unless they are corrected.
+    timed
+        Whether one of the files has no times of its own.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Pair:
     track: Track
     offset_ns: int = 0
     turn: Array | None = None
+    timed: bool = False
 
     @property
     def truth(self) -> Array:
@@ -82,7 +85,10 @@ def pair_of(name: str, group: str, estimate: Poses, truth: Poses) -> Pair:
             f"found one every {period_s:.3g} s; between its poses a path would be cut short"
         )
     track = Track(truth.stamps_ns, truth.poses)
-    pair = Pair(name, group, estimate.stamps_ns, estimate.poses, estimate.columns, track)
+    timed = estimate.timed or truth.timed
+    pair = Pair(
+        name, group, estimate.stamps_ns, estimate.poses, estimate.columns, track, timed=timed
+    )
     both = np.isfinite(np.concatenate([pair.truth, pair.estimate], axis=1)).all(axis=1)
     if both.sum() < LEAST_POSES:
         raise SourceError(

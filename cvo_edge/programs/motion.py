@@ -275,11 +275,12 @@ def annotate(
     if estimate == "-":
         if anchors is not None:
             raise UsageError("--anchors: expected a file of poses, found standard input")
+        Reading(None, times, fps).check_used(timed=False)
         refuse_overwriting(output, motion)
         annotate_stream(calibration, level, output, written_as, covariance)
         return
     refuse_overwriting(output, estimate, motion, times, anchors)
-    poses = Reading(None, times, fps).poses(Path(estimate))
+    poses = Reading(None, times, fps).one(Path(estimate))
     annotate_file(calibration, level, poses, output, written_as, anchors, covariance)
 
 

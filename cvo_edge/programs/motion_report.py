@@ -197,6 +197,10 @@ def audit_lines(report: Audit) -> Iterator[str]:
     if withheld:
         names = ", ".join(f"{printable(name)} {share:.2f}" for name, share in withheld.items())
         yield f"share of poses without intervals, as faster or rougher than calibrated: {names}"
+    rate = {each.name: each.other_rate for each in report.recordings if each.other_rate >= 0.005}
+    if rate:
+        names = ", ".join(f"{printable(name)} {share:.2f}" for name, share in rate.items())
+        yield f"share of poses at another rate, without horizons in frames and integrated: {names}"
     yield (
         f"{'horizon':>8}{'recordings':>12}{'each DoF':>10}{'all six':>9}{'position':>10}"
         f"{'rotation':>10}{'least':>7}  mean half-width, radius"

@@ -56,8 +56,25 @@ class Reading(NamedTuple):
     times: Path | None = None
     fps: float | None = None
 
+    def one(self, path: Path) -> Poses:
+        """Read the only file of a command; raises SourceError and UsageError."""
+        poses = self.poses(path)
+        self.check_used(poses.timed)
+        return poses
+
+    def check_used(self, timed: bool) -> None:
+        """Raise UsageError if times were given for files that all have their own."""
+        if self.times is not None and self.fps is not None:
+            raise UsageError("--times, --fps: expected one of them, found both")
+        if not timed and (self.times is not None or self.fps is not None):
+            option = "--times" if self.fps is None else "--fps"
+            raise UsageError(
+                f"{option}: expected poses without times (kitti), found stamps in the files; leave "
+                "it out"
+            )
+
     def poses(self, path: Path, times: Path | None = None) -> Poses:
-        """Read a file; raises SourceError and UsageError."""
+        """Read one of several files; raises SourceError and UsageError."""
         if self.fps is not None and not math.isfinite(self.fps):
             raise UsageError(f"--fps: expected a number, found {self.fps}")
         return read_poses(path, self.format).stamped(times or self.times, self.fps)
@@ -125,8 +142,11 @@ def read_pairs(
     """
     names = _names([each.estimate for each in files])
     pairs = spread(files).map(partial(_read, reading=reading, last={}), names, what="reading")
-    truths = pairs.map(_digest, what="reading").collect()
-    groups, notes = _groups(files, names, truths)
+    seen = pairs.map(_seen, what="reading").collect()
+    reading.check_used(
+        any(timed for (_, timed), each in zip(seen, files, strict=True) if each.times is None)
+    )
+    groups, notes = _groups(files, names, [truth for truth, _ in seen])
     return ReadPairs(pairs.map(_grouped, groups), notes)
 
 
@@ -139,15 +159,22 @@ def _read(
         truth = reading.poses(files.truth, files.times)
         last.clear()
         last[key] = truth
-    return pair_of(name, "", reading.poses(files.estimate, files.times), last[key])
+    pair = pair_of(name, "", reading.poses(files.estimate, files.times), last[key])
+    if files.times is not None and not pair.timed:
+        raise UsageError(
+            f"{files.times}: expected poses without times (kitti), found stamps in "
+            f"{files.estimate} and {files.truth}; leave it out"
+        )
+    return pair
 
 
 def _grouped(pair: Pair, group: str) -> Pair:
     return replace(pair, group=group)
 
 
-def _digest(pair: Pair) -> str:
-    return sha256(pair.track.poses.tobytes()).hexdigest()
+def _seen(pair: Pair) -> tuple[str, bool]:
+    """Return what tells one truth from another, and whether a file has no times."""
+    return sha256(pair.track.poses.tobytes()).hexdigest(), pair.timed
 
 
 def _groups(

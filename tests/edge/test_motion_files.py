@@ -1,6 +1,7 @@
 """``motion.json``, trajectories in files, and the commands on them."""
 
 import json
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import get_args
@@ -270,6 +271,33 @@ def test_another_rate_ends_horizons_in_frames(calibration: MotionCalibration) ->
     assert not record.reasons
 
 
+@pytest.mark.parametrize("kind", ["faster", "slower rate"])
+def test_an_audit_counts_what_is_stated(calibration: MotionCalibration, kind: str) -> None:
+    pair = drive(1, 400)
+    if kind == "faster":
+        # From the middle on; the truth drives the same.
+        for poses in (pair.estimate, pair.track.poses):
+            poses[200:, :3] = poses[200, :3] + 3.0 * (poses[200:, :3] - poses[200, :3])
+    else:
+        every = slice(None, None, 2)
+        pair = replace(pair, stamps_ns=pair.stamps_ns[every], estimate=pair.estimate[every])
+    level = calibration.level()
+    records = list(
+        annotate(calibration, level, pair.stamps_ns, pair.estimate, {}, covariance="integrated")
+    )
+    (found,) = audit(calibration, level, [pair]).recordings
+    for place, each in enumerate(found.horizons):
+        assert each.motions == sum(record.motion[place].bounded for record in records)
+    unfamiliar = [MotionReason.MOTION_UNFAMILIAR in record.reasons for record in records]
+    rate = [MotionReason.RATE_DIFFERS in record.reasons for record in records]
+    assert (found.withheld, found.other_rate) == pytest.approx((np.mean(unfamiliar), np.mean(rate)))
+    assert max(found.withheld, found.other_rate) > 0.1
+    # Sums over 10 s need a covariance at each of 200 steps.
+    sums = [each.sums for each in found.integrated]
+    assert sums[-1:] == ([unfamiliar.index(True) - 200] if kind == "faster" else [])
+    assert bool(sums) == any(record.covariance for record in records)
+
+
 def test_wrong_poses_are_refused(calibration: MotionCalibration) -> None:
     tracker = MotionTracker(calibration)
     wrong = ([0.0] * 6, "pose", {}, [True] * 7, [1j] * 7, [[0.0] * 7])
@@ -499,6 +527,10 @@ def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -
         (["audit", *one, tmp_path / "none.json"], 3, "no such file"),
         (["annotate", one[0], motion, "--confidence", "0.7"], 2, "confidence: expected"),
         (["annotate", tmp_path / "none.tum", motion], 6, "none.tum"),
+        (["annotate", one[0], motion, "--fps", "10"], 2, "--fps: expected poses without times"),
+        (["annotate", "-", motion, "--fps", "10"], 2, "--fps: expected poses without times"),
+        (["audit", *one, motion, "--times", one[0]], 2, "--times: expected poses without times"),
+        (["audit", *one, motion, "--times", one[0], "--fps", "9"], 2, "expected one of them"),
     ]
     for words, code, message in cases:
         found, text = run(*words)
