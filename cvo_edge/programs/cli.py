@@ -13,6 +13,7 @@ from cvo_edge.files import refuse_overwriting, write_text
 from cvo_edge.process import guarded, say
 from cvo_edge.programs.examine import cache, doctor, inspect, schema, verify
 from cvo_edge.programs.motion import annotate, audit, conformalize
+from cvo_edge.programs.odometry import odometry
 from cvo_edge.programs.options import (
     INTERVALS,
     REPORT,
@@ -294,7 +295,7 @@ def drift(
         raise GateError(f"drift: expected a martingale of at most {max_martingale:g}, {found}")
 
 
-for command in (conformalize, annotate, audit, verify, inspect, schema, doctor, cache):
+for command in (odometry, conformalize, annotate, audit, verify, inspect, schema, doctor, cache):
     app.command()(command)
 
 

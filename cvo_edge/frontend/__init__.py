@@ -1,0 +1,1 @@
+"""Monocular visual odometry without a network: rotation and direction between two images."""

@@ -1,0 +1,78 @@
+"""Points that two images share: corners of the first one, followed into the second and back."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Grey = NDArray[np.uint8]
+Points = NDArray[np.float32]
+
+# Corners that are asked for; their distance spreads them over the image.
+_MOST = 400
+_SPREAD = 0.6
+# Of the strongest corner's smaller eigenvalue (Shi and Tomasi 1994).
+_QUALITY = 0.01
+# Side of the window that is followed, pixels; shortest side of the pyramid's top.
+_WINDOW = 15
+_TOP, _MOST_LEVELS = 30, 6
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02)
+# A point that is followed back has to come this near to where it was, pixels.
+_BACK = 1.0
+
+
+class Tracks(NamedTuple):
+    """The same points in two images, pixels, (n, 2) each."""
+
+    first: Points
+    second: Points
+
+
+def corners(image: Grey) -> Points:
+    """Return the corners (n, 2) of an image (height, width), well apart from each other."""
+    height, width = image.shape
+    apart = _SPREAD * math.sqrt(height * width / _MOST)
+    found = cv2.goodFeaturesToTrack(image, _MOST, _QUALITY, apart)
+    # None without any.
+    return np.asarray([] if found is None else found, np.float32).reshape(-1, 2)
+
+
+def follow(before: Grey, after: Grey, points: Points) -> Tracks:
+    """Follow points (n, 2) from an image to the next one by pyramidal Lucas-Kanade, and back.
+
+    Those that do not come back are left out (Kalal, Mikolajczyk and Matas 2010).
+    """
+    if not len(points):
+        return Tracks(points, points)
+    shortest = min(before.shape)
+    levels = max(0, min(_MOST_LEVELS, math.floor(math.log2(shortest / _TOP))))
+    window = (_WINDOW, _WINDOW)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before,
+        after,
+        points,
+        np.empty_like(points),
+        winSize=window,
+        maxLevel=levels,
+        criteria=_CRITERIA,
+    )
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(
+        after,
+        before,
+        there,
+        points.copy(),
+        winSize=window,
+        maxLevel=min(1, levels),
+        criteria=_CRITERIA,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    height, width = before.shape
+    x, y = there.T
+    kept = (found.ravel() > 0) & (returned.ravel() > 0)
+    kept &= np.abs(back - points).max(axis=1) < _BACK
+    kept &= (x >= 0.0) & (y >= 0.0) & (x <= width - 1.0) & (y <= height - 1.0)
+    return Tracks(points[kept], np.asarray(there[kept], np.float32))

@@ -1,0 +1,183 @@
+"""The command ``odometry``: arguments and output only."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.files import refuse_overwriting
+from cvo_edge.process import say
+from cvo_edge.programs.options import (
+    REPORT,
+    MaxFramesOption,
+    OutputOption,
+    StampsOption,
+    TimeoutOption,
+    examples,
+)
+
+if TYPE_CHECKING:
+    from cvo_edge.camera import Camera
+    from cvo_edge.frontend.odometry import Lengths
+    from cvo_edge.frontend.steps import Step
+
+# Poses of --scale count within this time.
+_NEAR_NS = 20_000_000
+
+StepFormat = Literal["jsonl", "tum"]
+_EXAMPLES = examples(
+    "cvo-edge odometry frames/ --camera camera.json --fps 30 -o steps.tum",
+    "cvo-edge odometry 0 --camera 640x480,585,585,320,240",
+)
+
+
+def odometry(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Folder of images, glob, video file, camera index or device, or stream address.",
+            show_default=False,
+        ),
+    ],
+    camera: Annotated[
+        Path,
+        typer.Option(
+            "--camera",
+            help="The camera: WIDTHxHEIGHT,FX,FY,CX,CY, or a JSON file with these fields and the "
+            "distortion.",
+            readable=False,
+            show_default=False,
+            rich_help_panel="Input",
+        ),
+    ],
+    output: OutputOption = "-",
+    format: Annotated[
+        StepFormat | None,
+        typer.Option(
+            help="jsonl: a record for each step; tum: the steps added up. Default: by the file's "
+            "suffix, else jsonl.",
+            show_default=False,
+            rich_help_panel=REPORT,
+        ),
+    ] = None,
+    scale: Annotated[
+        Path | None,
+        typer.Option(
+            help="Trajectory that the lengths of steps come from, such as wheel odometry: tum, "
+            "euroc, openvins, or kitti with --fps.",
+            readable=False,
+            show_default=False,
+            rich_help_panel="Input",
+        ),
+    ] = None,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="No summary.", rich_help_panel=REPORT)
+    ] = False,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Stamp frames at this rate, from zero.", rich_help_panel="Input"),
+    ] = None,
+    stamps: StampsOption = None,
+    max_frames: MaxFramesOption = None,
+    timeout: TimeoutOption = 5.0,
+) -> None:
+    """Estimate rotation and direction of a camera's motion, frame by frame, without a network."""
+    import cv2
+
+    from cvo_edge.camera import checked_camera, read_camera
+    from cvo_edge.frontend.odometry import FrontEnd
+    from cvo_edge.frontend.records import json_heading, json_line, tum_heading, tum_row
+    from cvo_edge.input.capture import shown
+    from cvo_edge.input.sources import open_source
+    from cvo_edge.output.lines import LineFile
+
+    # For so little work, threads cost more processor time than they save.
+    cv2.setNumThreads(1)
+    written_as = _format_of(output, format)
+    refuse_overwriting(output, source, camera, scale, stamps)
+    calibrated = checked_camera(read_camera(camera))
+    lengths = None if scale is None else _lengths(scale, fps)
+    frames = open_source(source, fps, timeout, stamps)
+    front = FrontEnd(calibrated, lengths)
+    heading, line = (json_heading, json_line) if written_as == "jsonl" else (tum_heading, tum_row)
+    first = heading(calibrated, None if scale is None else scale.name)
+    seen: Counter[str] = Counter()
+    with LineFile(output) as lines, closing(front.stream(frames)) as steps:
+        try:
+            for step in islice(steps, max_frames):
+                _check(step, source, calibrated, written_as, scale)
+                lines.write(first + line(step))
+                first = b""
+                seen.update([step.status, *step.reasons])
+        finally:
+            if not quiet and seen:
+                say(_summary(seen))
+    if not seen["ok"]:
+        raise SourceError(
+            f"{shown(source)}: expected two images of one place or more, found no step with a "
+            f"motion in {_frames(seen)} frames"
+        )
+
+
+def _format_of(output: str, format: StepFormat | None) -> StepFormat:
+    suffix = Path(output).suffix.lower()
+    of_suffix: StepFormat = "tum" if suffix in (".tum", ".txt") else "jsonl"
+    return format or of_suffix
+
+
+def _lengths(path: Path, fps: float | None) -> Lengths:
+    """Return a trajectory as the distance between its poses at two stamps."""
+    import numpy as np
+
+    from cvo_edge.motion.files import read_poses
+    from cvo_edge.trajectories.interpolation import Track
+
+    poses = read_poses(path).stamped(None, fps)
+    track = Track(poses.stamps_ns, poses.poses)
+    usual_ns = float(np.median(np.diff(poses.stamps_ns))) if len(poses.stamps_ns) > 1 else 0.0
+    bound_ns = round(max(_NEAR_NS, usual_ns))
+
+    def length_m(begin_ns: int, end_ns: int) -> float | None:
+        both, _ = track.poses_at(np.array([begin_ns, end_ns]), bound_ns)
+        length = float(np.linalg.norm(both[1, :3] - both[0, :3]))
+        return length if length == length else None
+
+    return length_m
+
+
+def _check(
+    step: Step, source: str, camera: Camera, written_as: StepFormat, scale: Path | None
+) -> None:
+    """Raise UsageError for a source of which no frame can be used: its size, or without stamps."""
+    from cvo_edge.frontend.steps import StepReason
+    from cvo_edge.input.capture import shown
+
+    if step.stamp_ns is None and (written_as == "tum" or scale is not None):
+        raise UsageError(
+            f"{shown(source)}: expected a stamp for every frame, {step.source or 'a frame'} has "
+            "none; give --fps or --stamps"
+        )
+    if step.seq == 0 and StepReason.IMAGE_SIZE in step.reasons:
+        raise UsageError(
+            f"{shown(source)}: expected images of {camera.width}x{camera.height} pixels, the size "
+            f"of the camera, found another; give the intrinsics for the images' size"
+        )
+
+
+def _frames(seen: Counter[str]) -> int:
+    return seen["ok"] + seen["degraded"] + seen["invalid"]
+
+
+def _summary(seen: Counter[str]) -> str:
+    named = ("ok", "degraded", "invalid")
+    counts = ", ".join(f"{seen[each]} {each}" for each in named)
+    lines = [f"steps    {_frames(seen)}: {counts}"]
+    if remarks := ", ".join(f"{key} {n}" for key, n in sorted(seen.items()) if key not in named):
+        lines.append(f"remarks  {remarks}")
+    return "\n".join(lines)
