@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import repeat
 
@@ -20,8 +19,8 @@ from cvo_edge.motion.records import (
     MotionReason,
     MotionRecord,
     SinceAnchor,
-    finite,
     recorded,
+    with_tube,
 )
 from cvo_edge.motion.trace import Rows, rows_of
 from cvo_edge.vocabulary import MotionCovariance
@@ -231,23 +230,17 @@ def _tube(
     seconds = 1e-9 * (rows.stamps_ns[ends] - rows.stamps_ns[anchors])
     metres = rows.path_m[ends] - rows.path_m[anchors]
     same = rows.part[anchors] == rows.part[ends]
-    columns = (same, anchors, seconds, metres, *window.radii(rows, anchors, ends, level).T)
-    return [
-        SinceAnchor(
-            none.window,
-            anchor,
-            time_s,
-            path_m,
-            finite(position),
-            finite(rotation),
-            max(position, rotation) < math.inf,
-        )
-        if known
-        else none
-        for known, anchor, time_s, path_m, position, rotation in zip(
-            *(column.tolist() for column in columns), strict=True
+    tubes = [
+        SinceAnchor(none.window, anchor, time_s, path_m) if known else none
+        for known, anchor, time_s, path_m in zip(
+            *(column.tolist() for column in (same, anchors, seconds, metres)), strict=True
         )
     ]
+    # Most poses of a drive with few anchors are beyond the window.
+    widths = window.tube(rows, anchors, ends, level)
+    for place in np.flatnonzero((widths < np.inf).any(axis=0)).tolist():
+        tubes[place] = with_tube(tubes[place], widths[:, place])
+    return tubes
 
 
 def _steps(

@@ -68,12 +68,16 @@ class NeesAudit(Struct, frozen=True):
 
 
 class WindowAudit(Struct, frozen=True):
-    """Share of one recording's windows whose tube holds the truth throughout."""
+    """Share of one recording's windows whose tube holds the truth throughout.
+
+    ``six``: all six degrees of freedom at once.
+    """
 
     window: str
     windows: int
     position: float
     rotation: float
+    six: float
 
 
 class RecordingAudit(Struct, frozen=True):
@@ -227,10 +231,10 @@ def _known(calibration: MotionCalibration, rows: Rows) -> bool:
 def _window(window: MotionWindow, rows: Rows, truth: Array, level: Level) -> WindowAudit:
     errors = window_errors(rows, truth, window.window)
     if not len(errors.anchor):
-        return WindowAudit(window.spec.window, 0, 0.0, 0.0)
+        return WindowAudit(window.spec.window, 0, 0.0, 0.0, 0.0)
     inside = window.scored(errors, level)
-    position, rotation = inside.mean(axis=0).tolist()
-    return WindowAudit(window.spec.window, len(inside), position, rotation)
+    position, rotation, six = inside.mean(axis=0).tolist()
+    return WindowAudit(window.spec.window, len(inside), position, rotation, six)
 
 
 def _integrated(

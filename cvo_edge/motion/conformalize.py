@@ -19,6 +19,7 @@ from cvo_edge.motion.covariance import (
 )
 from cvo_edge.motion.drift import fit_familiar
 from cvo_edge.motion.errors import Errors, errors_of
+from cvo_edge.motion.fitting import Scale
 from cvo_edge.motion.format import (
     LEVELS,
     CorrectionSpec,
@@ -48,14 +49,8 @@ from cvo_edge.motion.recordings import (
     size_of,
 )
 from cvo_edge.motion.thresholds import Scores
-from cvo_edge.motion.windows import (
-    Window,
-    anchors_of,
-    knots_of,
-    profile_of,
-    window_errors,
-    window_scores,
-)
+from cvo_edge.motion.tube_fit import fit_tube
+from cvo_edge.motion.windows import Window, anchors_of, window_errors
 from cvo_edge.spread import Spread
 from cvo_edge.vocabulary import MOTION_RULES
 
@@ -67,6 +62,8 @@ DEFAULT_WINDOWS = tuple(map(Horizon.parse, ("10s", "100m")))
 _LEAST_MOTIONS = 20
 # Bias and scale have some twenty numbers each. So many motions that do not overlap fix them.
 _LEAST_APART = 200
+# The scale of a tube has seven.
+_LEAST_WINDOWS = 100
 _JOINT_LEVEL = 0.9
 _MOST_RECORDINGS = 100
 # Significant digits of coefficients and thresholds: nine horizons have to fit into 64 KiB.
@@ -137,7 +134,7 @@ def conformalize(
     tubes = [
         tube
         for window in (DEFAULT_WINDOWS if windows is None else windows)
-        if (tube := _window(window, recordings, groups, needed=windows is not None))
+        if (tube := _window(window, recordings, groups, learned, needed=windows is not None))
     ]
     if not specs:
         raise UsageError(
@@ -212,13 +209,7 @@ def _horizon(
         recordings=len(set(own)),
         motions=sum(counts[index] for index in used),
         bias=None if bias is None else tuple(map(_numbers, bias)),
-        scale=None
-        if scale is None
-        else ScaleSpec(
-            coefficients=tuple(map(_numbers, scale.coefficients)),
-            lowest=_numbers(scale.lowest),
-            highest=_numbers(scale.highest),
-        ),
+        scale=None if scale is None else _scale(scale),
         joint=_numbers(unit),
         # Rounded, a nearly singular matrix might no longer be positive definite.
         shape=tuple(_rounded(value, _EXACT) for value in shape[np.tril_indices(6)].tolist()),
@@ -293,7 +284,12 @@ def _sums(recording: Recording, steps: MotionHorizon, apart: int) -> list[Sums]:
 
 
 def _window(
-    window: Horizon, recordings: Spread[Recording], groups: Sequence[str], *, needed: bool
+    window: Horizon,
+    recordings: Spread[Recording],
+    groups: Sequence[str],
+    learned: bool,
+    *,
+    needed: bool,
 ) -> WindowSpec | None:
     """Calibrate a window; without enough drives for it, return None or, if needed, raise."""
     every = recordings.map(partial(_window_errors, window=window), what=f"window {window}")
@@ -304,25 +300,31 @@ def _window(
         if needed:
             raise _too_short("window", window, recordings)
         return None
-    errors = every.take(used)
-    knots, profile = knots_of(window), profile_of(window, errors, own)
-    # Scores are those of the profile that is stored.
-    position, rotation = map(_numbers, profile.T)
-    stored = np.array([position, rotation]).T
-    measured = partial(window_scores, knots=knots, profile=stored)
-    scores = Scores(errors.map(measured).collect(), own)
+    lengths = recordings.map(partial(extent, horizon=window)).collect()
+    apart = sum(lengths[index] for index in used) / window.value
+    tube = fit_tube(window, every.take(used), own, learned and apart >= _LEAST_WINDOWS)
+    table = Scores(tube.scores, own).table(MOTION_RULES, LEVELS)
     return WindowSpec(
         window=str(window),
         recordings=len(set(own)),
         anchors=sum(anchors),
-        position=position,
-        rotation=rotation,
+        scale=_scale(tube.scale),
+        unit=_numbers(tube.unit),
+        usual=_numbers(tube.usual),
         thresholds=tuple(
-            TubeThresholdSpec(rule=rule, confidence=level, q=(q[0], q[1]))
-            for rule, row in zip(MOTION_RULES, scores.table(MOTION_RULES, LEVELS), strict=True)
+            TubeThresholdSpec(rule=rule, confidence=level, q=(position, rotation, six))
+            for rule, row in zip(MOTION_RULES, table, strict=True)
             for level, each in zip(LEVELS, row, strict=True)
-            for q in [_thresholds(each)]
+            for position, rotation, six in [_thresholds(each)]
         ),
+    )
+
+
+def _scale(scale: Scale) -> ScaleSpec:
+    return ScaleSpec(
+        coefficients=tuple(map(_numbers, scale.coefficients)),
+        lowest=_numbers(scale.lowest),
+        highest=_numbers(scale.highest),
     )
 
 

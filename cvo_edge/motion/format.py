@@ -16,8 +16,7 @@ from cvo_edge.documents import UNWRITTEN, decode_document, encode_document, show
 from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.files import read_regular_file
 from cvo_edge.motion.horizons import Horizon
-from cvo_edge.motion.trace import LAGS, scale_width
-from cvo_edge.motion.windows import KNOTS
+from cvo_edge.motion.trace import LAGS, scale_width, tube_width
 from cvo_edge.vocabulary import MOTION_RULES, VERSION, MotionRule
 
 SCHEMA_VERSION = 1
@@ -95,24 +94,27 @@ class HorizonSpec(_Strict, frozen=True):
 
 
 class TubeThresholdSpec(_Strict, frozen=True):
-    """Thresholds for the scores of position and rotation; null is unbounded."""
+    """Thresholds for position, rotation and all six degrees of freedom; null is unbounded."""
 
     rule: MotionRule
     confidence: Annotated[float, Meta(gt=0, lt=1)]
-    q: tuple[_Threshold | None, _Threshold | None]
+    q: tuple[_Threshold | None, _Threshold | None, _Threshold | None]
 
 
 class WindowSpec(_Strict, frozen=True):
-    """A window and its tube, see ``windows``: profile (m and rad) and thresholds on scores.
+    """A window and its tube, see ``windows``: scale and thresholds on scores.
 
     ``recordings`` and ``anchors``: how many it is calibrated on.
+    ``unit``: thresholds of the six degrees of freedom that the score of all six is measured in.
+    ``usual``: mean scale of each error at the end of the window.
     """
 
     window: _Form
     recordings: _Count
     anchors: _Count
-    position: tuple[Positive, ...]
-    rotation: tuple[Positive, ...]
+    scale: ScaleSpec
+    unit: tuple[Positive, ...]
+    usual: tuple[Positive, ...]
     thresholds: tuple[TubeThresholdSpec, ...]
 
 
@@ -204,8 +206,10 @@ def _check(file: MotionFile) -> None:
     for window in file.windows:
         where = f"window {window.window}"
         _check_name(where, window.window)
-        _check_shape(where, [window.position, window.rotation], (2, KNOTS))
-        _check_thresholds(where, window.thresholds, 2)
+        _check_scale(where, window.scale, tube_width(len(file.columns)))
+        _check_shape(f"{where}: unit", [window.unit], (1, 6))
+        _check_shape(f"{where}: usual", [window.usual], (1, 8))
+        _check_thresholds(where, window.thresholds, 3)
     sizes = 4 + len(file.columns)
     _check_shape("familiar", [file.familiar.mean, file.familiar.spread], (2, sizes))
     width = scale_width(len(file.columns))
@@ -214,9 +218,7 @@ def _check(file: MotionFile) -> None:
         _check_name(where, spec.horizon)
         _check_shape(f"{where}: bias", spec.bias, (BIAS_WIDTH, 6))
         if spec.scale is not None:
-            _check_shape(f"{where}: scale.coefficients", spec.scale.coefficients, (1 + width, 8))
-            for key in ("lowest", "highest"):
-                _check_shape(f"{where}: scale.{key}", [getattr(spec.scale, key)], (1, width))
+            _check_scale(where, spec.scale, width)
         _check_shape(f"{where}: joint", [spec.joint], (1, 6))
         _check_shape(f"{where}: usual", [spec.usual], (1, 8))
         _check_shape(f"{where}: shape", [spec.shape], (1, 21))
@@ -250,6 +252,12 @@ def _check_name(where: str, name: str) -> None:
         Horizon.parse(name)
     except UsageError:
         raise CalibrationFileError(f"{where}: expected e.g. 1f, 5s or 100m") from None
+
+
+def _check_scale(where: str, scale: ScaleSpec, width: int) -> None:
+    _check_shape(f"{where}: scale.coefficients", scale.coefficients, (1 + width, 8))
+    for key in ("lowest", "highest"):
+        _check_shape(f"{where}: scale.{key}", [getattr(scale, key)], (1, width))
 
 
 def _check_shape(

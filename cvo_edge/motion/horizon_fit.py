@@ -33,7 +33,7 @@ from cvo_edge.spread import Spread
 Array = NDArray[np.float64]
 
 FOLDS = 12
-_LEVEL = 0.9
+LEVEL = 0.9
 _WORTH = 0.98
 # Columns of scores: the translation's and the rotation's three, and their norms.
 HALVES = ((0, 1, 2, 6), (3, 4, 5, 7))
@@ -117,27 +117,26 @@ def fit_horizon(errors: Spread[Errors], groups: Sequence[str], learned: bool) ->
     if not learned:
         plain = errors.map(_plain)
         return Crossed(Fit(None, None), plain.map(_joined), (_VARIANTS[0],) * len(HALVES))
-    names = sorted(set(groups))
-    folds = [names.index(group) % FOLDS for group in groups]
+    folds = folds_of(groups)
     biases, plain_sums = zip(*errors.map(_first_sums).collect(), strict=True)
-    of_fold, bias = _crossed(biases, folds, solve_bias)
+    of_fold, bias = crossed(biases, folds, solve_bias)
     own = [of_fold[fold] for fold in folds]
     rest_sums = errors.map(_second_sums, own).collect()
-    crossed = [_crossed(sums, folds, solve_scale) for sums in (plain_sums, rest_sums)]
+    scales = [crossed(sums, folds, solve_scale) for sums in (plain_sums, rest_sums)]
     without = [
         _Models(each, (plain, rest))
-        for each, plain, rest in zip(of_fold, crossed[0][0], crossed[1][0], strict=True)
+        for each, plain, rest in zip(of_fold, scales[0][0], scales[1][0], strict=True)
     ]
     tried = errors.map(_tried, [without[fold] for fold in folds])
     thresholds = [
         Scores(tried.map(partial(Tried.scores, variant=each)).collect(), groups).thresholds(
-            "mean", _LEVEL
+            "mean", LEVEL
         )
         for each in _VARIANTS
     ]
     costs = np.mean(tried.map(partial(_costs, thresholds=thresholds)).collect(), axis=0)
     chosen = tuple(_choice(costs[:, half]) for half in HALVES)
-    whole = _Models(bias, (crossed[0][1], crossed[1][1]))
+    whole = _Models(bias, (scales[0][1], scales[1][1]))
     return Crossed(_kept(whole, chosen), tried.map(partial(_joined, chosen=chosen)), chosen)
 
 
@@ -164,7 +163,7 @@ def _tried(errors: Errors, models: _Models) -> Tried:
 
 def _costs(tried: Tried, thresholds: Sequence[Array]) -> Array:
     """Return the mean interval score of each variant's crossed intervals, (variants, 8)."""
-    penalty = 1.0 / (1.0 - _LEVEL)
+    penalty = 1.0 / (1.0 - LEVEL)
     costs = []
     for variant, q in zip(_VARIANTS, thresholds, strict=True):
         over = np.maximum(tried.scores(variant) - q, 0.0)
@@ -193,7 +192,13 @@ def _joined(
     return scaled, scores
 
 
-def _crossed(
+def folds_of(groups: Sequence[str]) -> list[int]:
+    """Return the fold of each recording; those of one group are together."""
+    names = sorted(set(groups))
+    return [names.index(group) % FOLDS for group in groups]
+
+
+def crossed(
     sums: Sequence[Normal], folds: Sequence[int], solve: Callable[[Normal], Model]
 ) -> tuple[list[Model], Model]:
     """Return what is fitted without each fold, and what is fitted on all."""

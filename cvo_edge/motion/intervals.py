@@ -19,14 +19,15 @@ from cvo_edge.motion.format import (
     LEVELS,
     HorizonSpec,
     MotionFile,
+    ScaleSpec,
     WindowSpec,
     read_motion_file,
     symmetric,
 )
 from cvo_edge.motion.horizons import Horizon
 from cvo_edge.motion.rate import periods_s
-from cvo_edge.motion.trace import Limits, Rows, motion_numbers, scale_numbers
-from cvo_edge.motion.windows import Window, knots_of, radii, window_scores
+from cvo_edge.motion.trace import Limits, Rows, motion_numbers, scale_numbers, tube_numbers
+from cvo_edge.motion.windows import Window, raised, window_scores, with_six
 from cvo_edge.vocabulary import MOTION_RULES, SCOPES, MotionRule, Scope
 
 Array = NDArray[np.float64]
@@ -91,10 +92,7 @@ class MotionHorizon:
         self.spec = spec
         self.horizon = Horizon.parse(spec.horizon)
         self.bias = None if spec.bias is None else np.array(spec.bias)[..., np.newaxis]
-        self.scale = None
-        if (scale := spec.scale) is not None:
-            fields = scale.coefficients, scale.lowest, scale.highest
-            self.scale = Scale(*(np.array(each)[..., np.newaxis] for each in fields))
+        self.scale = None if spec.scale is None else _scale(spec.scale)
         self._joint = np.array(spec.joint)
         self.shape = Shape(symmetric(spec.shape))
         self._thresholds = {
@@ -146,30 +144,36 @@ class MotionWindow:
     def __init__(self, spec: WindowSpec) -> None:
         self.spec = spec
         self.window = Horizon.parse(spec.window)
-        self._knots = knots_of(self.window)
-        self._profile = np.array([spec.position, spec.rotation]).T
+        self._scale = _scale(spec.scale)
+        self._unit = np.array(spec.unit)
         self._thresholds = {
             (each.rule, each.confidence): np.array([np.inf if q is None else q for q in each.q])
             for each in spec.thresholds
         }
 
-    def scored(self, window: Window, level: Level) -> Mask:
-        """Return whether all of each window is inside, (anchors, 2)."""
-        q = self._thresholds[level.rule, level.confidence]
-        return np.asarray(window_scores(window, self._knots, self._profile) <= q)
+    def thresholds(self, level: Level) -> Array:
+        """Return the thresholds (8,) of the six degrees of freedom, all at once, and of the norms.
 
-    def mean_radii(self, level: Level) -> Array:
-        """Return the mean radii (2,) over the window."""
-        along = np.linspace(0.04, 1.0, 25) * self.window.value
-        tube = radii(self._knots, self._profile, along).mean(axis=0)
-        return np.asarray(self._thresholds[level.rule, level.confidence] * tube)
+        They are the same in both scopes.
+        """
+        position, rotation, six = self._thresholds[level.rule, level.confidence]
+        return np.concatenate([six * self._unit, [position, rotation]])
+
+    def scored(self, window: Window, level: Level) -> Mask:
+        """Return whether all of each window is inside, (anchors, 3).
+
+        The columns are position, rotation, and all six degrees of freedom at once.
+        """
+        scores = window_scores(window, self._scales(window.along, window.numbers).T)
+        q = self._thresholds[level.rule, level.confidence]
+        return np.asarray(with_six(scores, self._unit) <= q)
 
     def end_radii(self, level: Level) -> Array:
-        """Return the radii (2,) at the end of the window."""
-        return np.asarray(self._thresholds[level.rule, level.confidence] * self._profile[-1])
+        """Return the usual radii (2,) at the end of the window."""
+        return np.asarray(self.thresholds(level)[6:] * np.array(self.spec.usual)[6:])
 
-    def radii(self, rows: Rows, anchor: Integers, ends: Integers, level: Level) -> Array:
-        """Return the radii (m, 2) at rows ``ends`` (m,) of position (m) and rotation (rad).
+    def tube(self, rows: Rows, anchor: Integers, ends: Integers, level: Level) -> Array:
+        """Return the half-widths and the two radii (8, m) at rows ``ends`` (m,), m and rad.
 
         They are infinite beyond the window and over a break since ``anchor`` (m,).
         """
@@ -177,10 +181,10 @@ class MotionWindow:
         seconds = 1e-9 * (rows.stamps_ns[ends] - rows.stamps_ns[anchor])
         metres = rows.path_m[ends] - rows.path_m[anchor]
         since = np.asarray(self.since(frames, seconds, metres), np.float64)
-        tube = self.after(since, level)
+        tube = self.after(since, tube_numbers(rows, anchor, ends), level)
         # At the anchor itself, nothing has moved yet.
-        tube[frames == 0] = 0.0
-        return np.where((rows.part[anchor] == rows.part[ends])[:, np.newaxis], tube, np.inf)
+        tube[:, frames == 0] = 0.0
+        return np.where(rows.part[anchor] == rows.part[ends], tube, np.inf)
 
     def since(self, frames: Measure, seconds: Measure, metres: Measure) -> Measure:
         """Return what the window is measured along."""
@@ -188,11 +192,19 @@ class MotionWindow:
             return frames
         return seconds if self.window.unit == "s" else metres
 
-    def after(self, since: Array, level: Level) -> Array:
-        """Return the radii (m, 2) so far (m,) after an anchor, infinite beyond the window."""
-        q = self._thresholds[level.rule, level.confidence]
-        inside = (since <= self.window.value)[:, np.newaxis]
-        return np.where(inside, q * radii(self._knots, self._profile, since), np.inf)
+    def after(self, since: Array, numbers: Array, level: Level) -> Array:
+        """Return the same (8, m) so far (m,) after an anchor, with ``tube_numbers`` (k, m)."""
+        tube = self._scales(since, numbers) * self.thresholds(level)[:, np.newaxis]
+        return np.where(since <= self.window.value, tube, np.inf)
+
+    def _scales(self, along: Array, numbers: Array) -> Array:
+        return predicted_scale(self._scale, numbers) * raised(self.window, along)
+
+
+def _scale(spec: ScaleSpec) -> Scale:
+    """Return coefficients and ranges as ``fitting.predicted_scale`` takes them."""
+    fields = spec.coefficients, spec.lowest, spec.highest
+    return Scale(*(np.array(each)[..., np.newaxis] for each in fields))
 
 
 class MotionCalibration:

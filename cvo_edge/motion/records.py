@@ -85,6 +85,9 @@ class SinceAnchor(_Strict, frozen=True):
         As calibrated, e.g. ``10s``.
     anchor_seq, seconds, metres
         The anchor, a pose that is taken as known, and how far it is back.
+    lower, upper
+        Bounds of x, as in ``MotionInterval``, of the motion since the anchor: all six hold at every
+        pose of the window at once, in both scopes. null beyond the window.
     position, rotation
         Radii around the estimated motion since the anchor that hold the true one, m and rad: at
         every pose of the window at once. null beyond the window.
@@ -96,6 +99,8 @@ class SinceAnchor(_Strict, frozen=True):
     anchor_seq: int | None = None
     seconds: float | None = None
     metres: float | None = None
+    lower: SixOrUnbounded | None = None
+    upper: SixOrUnbounded | None = None
     position: float | None = None
     rotation: float | None = None
     bounded: bool = False
@@ -188,3 +193,19 @@ def six(values: Sequence[float]) -> SixOrUnbounded:
 def finite(value: float) -> float | None:
     """Return a radius; None if it is infinite."""
     return value if value < math.inf else None
+
+
+def with_tube(since: SinceAnchor, widths: Array) -> SinceAnchor:
+    """Return what is known of an anchor with half-widths and the two radii (8,) of its tube."""
+    *upper, position, rotation = widths.tolist()
+    return SinceAnchor(
+        since.window,
+        since.anchor_seq,
+        since.seconds,
+        since.metres,
+        six([-value for value in upper]),
+        six(upper),
+        finite(position),
+        finite(rotation),
+        max(*upper, position, rotation) < math.inf,
+    )

@@ -151,6 +151,21 @@ def scale_numbers(rows: Rows, start: Integers, end: Integers, recent: Integers) 
     return np.concatenate(sizes).T
 
 
+def tube_numbers(rows: Rows, start: Integers, end: Integers) -> Array:
+    """Return the numbers that a tube's logarithms are linear in, (``tube_width``, m).
+
+    They are means since the anchor ``start``, and how far it is back in time and along the path.
+    """
+    seconds = 1e-9 * (rows.stamps_ns[end] - rows.stamps_ns[start])
+    metres = rows.path_m[end] - rows.path_m[start]
+    return since_numbers(_means(rows, start, end), np.stack([seconds, metres]))
+
+
+def since_numbers(means: Array, extent: Array) -> Array:
+    """Return the same from means (4 + columns, m), and seconds and metres (2, m)."""
+    return np.concatenate([logarithms(means), np.log(extent + LEAST)])
+
+
 RECENT = Horizon("s", _RECENT_S)
 RECENT_NS = round(1e9 * _RECENT_S)
 
@@ -173,3 +188,8 @@ def _means(rows: Rows, start: Integers, end: Integers) -> Array:
 def scale_width(columns: int) -> int:
     """Return how many numbers ``scale_numbers`` gives with this many columns of a file."""
     return 2 * MEANS + 6 + 2 + 2 * columns
+
+
+def tube_width(columns: int) -> int:
+    """Return how many numbers ``tube_numbers`` gives with this many columns of a file."""
+    return MEANS + columns + 2

@@ -32,9 +32,10 @@ from cvo_edge.motion.records import (
     finite,
     recorded,
     six,
+    with_tube,
 )
 from cvo_edge.motion.relative import motion, residual
-from cvo_edge.motion.trace import column_logarithms
+from cvo_edge.motion.trace import column_logarithms, since_numbers
 from cvo_edge.pose import Pose
 from cvo_edge.vocabulary import MotionCovariance, MotionRule, Scope
 
@@ -349,16 +350,14 @@ class MotionTracker:
             return self._outside
         seconds = 1e-9 * (kept.stamps_ns[last] - kept.stamps_ns[row])
         metres = kept.path_m[last] - kept.path_m[row]
+        frames, extent = last - row, np.array([[seconds], [metres]])
+        numbers = since_numbers(np.array(kept.means(row, last))[:, np.newaxis], extent)
         tubes = []
         for window in self.calibration.windows:
-            since = window.since(last - row, seconds, metres)
-            radii = [0.0, 0.0] if row == last else [math.inf, math.inf]
-            if row < last and since <= window.window.value:
-                radii = window.after(np.array([since]), self.level)[0].tolist()
-            position, rotation = map(finite, radii)
-            bounded = max(radii) < math.inf
-            name = window.spec.window
-            tubes.append(
-                SinceAnchor(name, self._anchor_seq, seconds, metres, position, rotation, bounded)
-            )
+            tube = SinceAnchor(window.spec.window, self._anchor_seq, seconds, metres)
+            since = window.since(frames, seconds, metres)
+            if since <= window.window.value:
+                widths = window.after(np.array([float(since)]), numbers, self.level)[:, 0]
+                tube = with_tube(tube, widths if frames else np.zeros(8))
+            tubes.append(tube)
         return tuple(tubes)

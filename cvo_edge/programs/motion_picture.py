@@ -86,7 +86,7 @@ def _draw_path(axes: Axes, calibration: MotionCalibration, level: Level, pair: P
             start = truth[anchor]
             seen = start[:3] + rotated(np.tile(start[3:], (len(ends), 1)), moved[:, :3])
             centre = truth[ends, :3] + times * (seen - truth[ends, :3])
-            radii = window.radii(rows, np.full(len(ends), anchor), ends, level)[:, 0]
+            radii = window.tube(rows, np.full(len(ends), anchor), ends, level)[6]
             off = norms(residual(moved, motion(truth[anchor], truth[ends])))[:, 0]
             for place in range(0, len(ends), every):
                 if np.isfinite(radii[place]):

@@ -173,7 +173,7 @@ def calibration_lines(file: MotionFile) -> Iterator[str]:
         parts = [f"{rule} {_radii(*end)}" for rule, end in zip(MOTION_RULES, ends, strict=True)]
         yield (
             f"tube of {window.spec.window}: {window.spec.recordings} drives, "
-            f"{window.spec.anchors} anchors; radius at its end: " + "; ".join(parts)
+            f"{window.spec.anchors} anchors; usual radius at its end: " + "; ".join(parts)
         )
     for rule in MOTION_RULES:
         yield f"{rule}: {calibration.statement(Level(rule=rule))}"
@@ -233,7 +233,8 @@ def audit_lines(report: Audit) -> Iterator[str]:
             yield (
                 f"tube of {name}: whole windows inside, over {len(windows)} recordings: position "
                 f"{np.mean([each.position for each in windows]):.3f}, rotation "
-                f"{np.mean([each.rotation for each in windows]):.3f}"
+                f"{np.mean([each.rotation for each in windows]):.3f}, all six "
+                f"{np.mean([each.six for each in windows]):.3f}"
             )
     yield "NEES over 6 (1 fits), and share up to chi-square's 0.9 quantile; means over recordings"
     for name in report.horizons:
