@@ -167,11 +167,11 @@ def left_out(pairs: Sequence[Pair]) -> dict[str, Any]:
         audits += audit(fitted, Level(LEVEL), own).recordings
         adapted += online(fitted, own)
         for window in fitted.windows:
-            bands = bands_of(window, others, fitted)
-            tubes.setdefault(window.spec.window, []).append(window.mean_radii(Level()) / bands)
+            widths = (tube_widths(window, own, fitted), bands_of(window, others, fitted))
+            tubes.setdefault(window.spec.window, []).append(np.array(widths))
     return {
         "horizons": [summary(name, rows) for name, rows in found.items()],
-        "tubes": [tube(name, ratios, audits) for name, ratios in tubes.items()],
+        "tubes": [tube(name, widths, audits) for name, widths in tubes.items()],
         "covariances": covariances(audits),
         "online": online_summary(adapted),
     }
@@ -233,7 +233,7 @@ def online_summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def bands_of(window: MotionWindow, pairs: Sequence[Pair], calibration: MotionCalibration) -> Array:
-    """Return the mean over a window of the errors (2,) that 90 % of motions do not exceed."""
+    """Return the mean over a window of the errors (8,) that 90 % of motions do not exceed."""
     places = np.linspace(0.04, 1.0, 25) * window.window.value
     parts = []
     for pair in pairs:
@@ -249,17 +249,32 @@ def bands_of(window: MotionWindow, pairs: Sequence[Pair], calibration: MotionCal
     return np.asarray(np.mean(bands, axis=0))
 
 
-def tube(name: str, ratios: list[Array], audits: Sequence[RecordingAudit]) -> dict[str, Any]:
-    """Return the share of windows inside, and the width over bands of single times."""
+def tube_widths(
+    window: MotionWindow, pairs: Sequence[Pair], calibration: MotionCalibration
+) -> Array:
+    """Return the mean over windows of half-widths and radii (8,); NaN without windows."""
+    found = []
+    for pair in pairs:
+        each = window_errors(trace_of(pair, calibration.limits, ()), pair.truth, window.window)
+        if len(each.anchor):
+            widths = window.after(each.along, each.numbers, Level(LEVEL))
+            found.append((each.shares * widths).sum(axis=1) / (each.anchor[-1] + 1))
+    return np.asarray(np.mean(found, axis=0)) if found else np.full(8, np.nan)
+
+
+def tube(name: str, widths: list[Array], audits: Sequence[RecordingAudit]) -> dict[str, Any]:
+    """Return the share of windows inside, and the mean width over bands of single times.
+
+    Both are of position, of rotation, and of all six degrees of freedom at once.
+    """
     whole = [each for one in audits for each in one.windows if each.window == name and each.windows]
+    of_tubes, of_bands = np.nanmean(widths, axis=0)
+    ratio = of_tubes / of_bands
     return {
         "window": name,
         "recordings": len(whole),
-        "inside": [
-            float(np.mean([each.position for each in whole])),
-            float(np.mean([each.rotation for each in whole])),
-        ],
-        "over_bands": np.mean(ratios, axis=0).tolist(),
+        "inside": np.mean([(w.position, w.rotation, w.six) for w in whole], axis=0).tolist(),
+        "over_bands": [*ratio[6:].tolist(), float(ratio[:6].mean())],
     }
 
 

@@ -17,6 +17,9 @@ from cvo_edge.motion.recordings import about, limits_of, trace_of
 from cvo_edge.motion.relative import motion, norms, residual
 from cvo_edge.motion.thresholds import CAP, Scores
 from cvo_edge.motion.trace import Limits, column_logarithms, rows_of
+from cvo_edge.motion.tube_fit import fit_tube
+from cvo_edge.motion.windows import Window
+from cvo_edge.spread import Here
 from cvo_edge.vocabulary import MOTION_RULES
 
 from .simulated_drives import chained, composed, drive, smooth, twist
@@ -198,3 +201,37 @@ def test_a_bias_that_is_linear_in_the_motion_is_found() -> None:
     before, after = (np.sqrt(np.mean(x**2, axis=0)) for x in (errors[2].residuals, rest))
     assert (after < 1.25 * np.repeat([0.002, 0.001], 3)).all()
     assert before[0] > 3.0 * after[0]
+
+
+@pytest.mark.parametrize("depends", [True, False])
+def test_a_tube_is_wider_where_errors_are_larger(depends: bool) -> None:
+    """Errors grow with the square root of time, in half of the windows four times as fast."""
+    generator = np.random.default_rng(6)
+    window, along = Horizon.parse("5s"), np.linspace(0.5, 5.0, 10)
+    recordings = []
+    for _ in range(6):
+        fast = generator.permutation(np.repeat([0.0, 1.0], 20))
+        sizes = np.exp(np.log(4.0) * fast * depends)[:, np.newaxis, np.newaxis]
+        errors = np.abs(generator.normal(size=(40, 10, 8))) * sizes * np.sqrt(along)[:, np.newaxis]
+        numbers = generator.normal(size=(6, 40, 10))
+        numbers[0], numbers[4] = fast[:, np.newaxis], np.log(along)
+        recordings.append(
+            Window(
+                np.repeat(np.arange(40), 10),
+                np.tile(along, 40),
+                errors.reshape(400, 8),
+                numbers.reshape(6, 400),
+            )
+        )
+    tube = fit_tube(window, Here(recordings), "abcdef", learned=True)
+    learned = tube.scale.coefficients
+    if depends:
+        # Small errors count as larger ones, so that the fit is flatter than the errors.
+        assert (learned[1] > 0.5 * np.log(4.0)).all()
+        assert (learned[1] < np.log(4.0)).all()
+        np.testing.assert_allclose(learned[5], 0.5, atol=0.2)
+    else:
+        assert not learned[[1, 2, 3, 4, 6]].any()
+    # The six degrees of freedom, each in its unit, are all inside as often as stated.
+    q = Scores(tube.scores, "abcdef").thresholds("mean", 0.9)
+    assert abs(np.mean(np.concatenate(tube.scores) <= q) - 0.9) < 0.01

@@ -249,6 +249,9 @@ def test_a_tube_starts_at_its_anchor(calibration: MotionCalibration) -> None:
     ] * 50
     radii = [each.position for each in tube[:101]]
     assert radii == sorted(radii)
+    for each in tube:
+        assert (each.upper is None) == (each.lower is None) == (not each.bounded)
+        assert each.upper is None or each.lower == tuple(-value for value in each.upper)
     with pytest.raises(UsageError, match=r"^stamp: expected"):
         tracker.anchor(anchor_ns + 1)
 
@@ -394,10 +397,11 @@ def test_intervals_hold_what_they_state() -> None:
     for rule in MOTION_RULES:
         report = audit(calibration, calibration.level(0.9, rule), drives[18:])
         shares[rule] = np.mean([x.position for each in report.recordings for x in each.horizons])
-        whole = [x.position for each in report.recordings for x in each.windows]
-        tubes[rule] = np.mean(whole)
+        whole = [(x.position, x.six) for each in report.recordings for x in each.windows]
+        tubes[rule] = np.mean(whole, axis=0)
     assert 0.85 <= shares["mean"] <= 0.95
-    assert 0.8 <= tubes["mean"] <= 0.97
+    assert all(0.8 <= share <= 0.97 for share in tubes["mean"])
+    assert (tubes["hierarchical"] >= tubes["mean"]).all()
     assert shares["hierarchical"] >= shares["capped"] >= shares["mean"]
     assert shares["tolerance"] >= 0.93
 
