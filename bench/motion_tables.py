@@ -8,12 +8,13 @@ from typing import Any
 from markdown_table import table
 from provenance import read_result, result_files
 
-FOLDER = "motion"
+FOLDER, FLEET = "motion", "fleet"
 
 
 def results() -> list[dict[str, Any]]:
     """Return the results of all sets."""
-    return [read_result(FOLDER, path.stem) for path in result_files(FOLDER)]
+    stems = [path.stem for path in result_files(FOLDER)]
+    return [read_result(FOLDER, stem) for stem in stems if stem != FLEET]
 
 
 def motion() -> str:
@@ -151,6 +152,25 @@ def costs() -> str:
     )
 
 
+def fleet() -> str:
+    """One row for each engine: time and memory of many recordings."""
+    found = read_result(FOLDER, FLEET)
+    size = f"{found['recordings']:,} recordings, {found['poses']:,} poses"
+    return table(
+        [size, "seconds", "of these alignment", "processor time, s", "peak memory here, MB"],
+        [
+            [
+                each["engine"],
+                f"{each['seconds']:.0f}",
+                f"{each['stages']['alignment']:.0f}",
+                f"{each['processor_s']:.0f}",
+                f"{each['peak_mb']:.0f}",
+            ]
+            for each in found["runs"]
+        ],
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "motion": motion,
     "motion-alignment": alignment,
@@ -158,4 +178,5 @@ TABLES: dict[str, Callable[[], str]] = {
     "motion-covariances": covariances,
     "motion-online": online,
     "motion-costs": costs,
+    "motion-fleet": fleet,
 }

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 from cvo_edge.files import write_text
 from cvo_edge.motion.conformalize import conformalize
-from cvo_edge.motion.format import encode_motion_file
+from cvo_edge.motion.corrections import Fit
+from cvo_edge.motion.format import MotionFile, encode_motion_file
 from cvo_edge.motion.horizons import Horizon
 from cvo_edge.programs.motion_report import calibration_lines, fit_lines
 from cvo_edge.programs.progress import items_progress
@@ -29,23 +30,20 @@ class Wanted(NamedTuple):
     corrections: Sequence[MotionCorrection]
 
 
+class Learned(NamedTuple):
+    """What was calibrated, and what was found of the pairs' alignment and drives."""
+
+    file: MotionFile
+    fits: list[Fit]
+    notes: list[str]
+
+
 def calibrate(
     files: Sequence[Files], reading: Reading, wanted: Wanted, output: str, engine: MotionEngine
 ) -> None:
     """Write ``motion.json`` and print the report."""
     with _spread(engine) as spread:
-        pairs, notes = read_pairs(files, reading, spread)
-        fitted = fits(pairs)
-        pairs, correction = correct_pairs(pairs, fitted, wanted.corrections)
-        file = conformalize(
-            pairs,
-            wanted.name,
-            wanted.horizons,
-            wanted.windows,
-            learned=wanted.learned,
-            columns=wanted.columns,
-            correction=correction,
-        )
+        file, fitted, notes = learn(files, reading, wanted, spread)
     content = encode_motion_file(file)
     # Before the report: whoever reads that may close the pipe.
     write_text(output, content.decode())
@@ -53,6 +51,28 @@ def calibrate(
         print(*fit_lines(fitted, wanted.corrections), *notes, sep="\n")
         print(*calibration_lines(file), sep="\n")
         print(f"-> {output}, {len(content)} bytes")
+
+
+def learn(
+    files: Sequence[Files],
+    reading: Reading,
+    wanted: Wanted,
+    spread: Callable[[Sequence[Files]], Spread[Any]],
+) -> Learned:
+    """Read and calibrate pairs where ``spread`` puts them."""
+    pairs, notes = read_pairs(files, reading, spread)
+    fitted = fits(pairs)
+    pairs, correction = correct_pairs(pairs, fitted, wanted.corrections)
+    file = conformalize(
+        pairs,
+        wanted.name,
+        wanted.horizons,
+        wanted.windows,
+        learned=wanted.learned,
+        columns=wanted.columns,
+        correction=correction,
+    )
+    return Learned(file, fitted, notes)
 
 
 @contextmanager
