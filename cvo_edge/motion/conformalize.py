@@ -123,7 +123,6 @@ def conformalize(
             )
     limits = limits_of(known)
     recordings = pairs.map(partial(recording_of, limits=limits, columns=tuple(columns)))
-    # Pairs take as much memory again.
     del pairs
     sizes = recordings.map(size_of).collect()
     specs = [

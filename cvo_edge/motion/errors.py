@@ -22,8 +22,6 @@ class Errors(NamedTuple):
     ----------
     end
         Shape (m,): the row of the pose at which each motion ends.
-    moved
-        Shape (m, 7): the estimated motions.
     numbers, sizes
         Shape (m, 24) and (m, k): see ``trace.motion_numbers`` and ``trace.scale_numbers``.
     residuals
@@ -31,7 +29,6 @@ class Errors(NamedTuple):
     """
 
     end: Integers
-    moved: Array
     numbers: Array
     sizes: Array
     residuals: Array
@@ -65,4 +62,4 @@ def errors_of(rows: Rows, truth: Array, horizon: Horizon) -> Errors:
     moved, numbers = motion_numbers(rows, start, end)
     sizes = scale_numbers(rows, start, end, recent)
     off = residual(moved, motion(truth[start], truth[end]))
-    return Errors(end, moved, numbers, sizes, off)
+    return Errors(end, numbers, sizes, off)

@@ -114,7 +114,7 @@ def _selected(values: Array, weights: Array, within: float) -> float:
         inside = np.flatnonzero((values > low) & (values <= high))
         inside = inside[np.argsort(values[inside])]
         index = int(np.searchsorted(below + np.cumsum(weights[inside]), within))
-        if below < within and index < len(inside):
+        if (below < within or math.isinf(low)) and index < len(inside):
             return float(values[inside[index]])
         if math.isinf(low) and math.isinf(high):
             return math.inf

@@ -62,9 +62,12 @@ def learn(
     """Read and calibrate pairs where ``spread`` puts them."""
     pairs, notes = read_pairs(files, reading, spread)
     fitted = fits(pairs)
-    pairs, correction = correct_pairs(pairs, fitted, wanted.corrections)
+    corrected, correction = correct_pairs(pairs, fitted, wanted.corrections)
+    # Pairs are let go once their rows are known, if nobody else keeps them.
+    only = [corrected]
+    del pairs, corrected
     file = conformalize(
-        pairs,
+        only.pop(),
         wanted.name,
         wanted.horizons,
         wanted.windows,

@@ -191,14 +191,14 @@ def _groups(
         own = given[0] if len(given) == 1 else min(drives[place] for place in places)
         for place in places:
             groups[place] = files[place].group or own
-        called = _listed_names([names[place] for place in places])
         if len(given) > 1:
+            called = _listed_names([names[place] for place in places])
             notes.append(
                 f"doubt: {called}: their truths have the same poses, but they count as drives "
                 f"{_listed_names(given)}"
             )
-        elif len({drives[place] for place in places}) > 1:
-            notes.append(f"one drive: {called}: their truths have the same poses")
+        elif len(copies := sorted({drives[place] for place in places})) > 1:
+            notes.append(f"one drive: the truths {_listed_names(copies)} have the same poses")
     return groups, notes
 
 

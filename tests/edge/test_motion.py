@@ -158,6 +158,22 @@ def test_thresholds_are_those_of_the_formulas(confidence: float) -> None:
         assert missed <= 1.0 - confidence + 1e-12 < too_many
 
 
+def test_one_threshold_is_that_of_the_table() -> None:
+    generator = np.random.default_rng(6)
+    # Ties, recordings of other sizes and scales, and all mass in one place.
+    scores = [
+        generator.lognormal(0.0, 1.0, (size, 2)).round(2) * [scale, 1.0 if scale < 3 else 0.0]
+        for size, scale in ((3000, 1.0), (20, 2.0), (700, 0.1), (2500, 5.0))
+    ]
+    found = Scores(scores, "abca")
+    levels = (0.01, 0.5, 0.9, 0.999)
+    table = found.table(MOTION_RULES, levels)
+    for row, rule in zip(table, MOTION_RULES, strict=True):
+        for expected, level in zip(row, levels, strict=True):
+            np.testing.assert_array_equal(found.thresholds(rule, level), expected)
+    assert np.isinf(table).any()
+
+
 def test_rules_hold_for_new_recordings() -> None:
     """Recordings of different difficulty; each redraw is a new calibration and a new recording."""
     generator = np.random.default_rng(5)
