@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import repeat
 
@@ -10,7 +11,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import Status
+from cvo_edge.estimate import RecordedPose, Status
 from cvo_edge.motion.covariance import in_fixed_axes
 from cvo_edge.motion.drift import Running
 from cvo_edge.motion.intervals import Level, MotionCalibration, MotionHorizon, MotionWindow
@@ -19,7 +20,6 @@ from cvo_edge.motion.records import (
     MotionReason,
     MotionRecord,
     SinceAnchor,
-    recorded,
     with_tube,
 )
 from cvo_edge.motion.trace import Rows, rows_of
@@ -129,7 +129,9 @@ def _records(
                 reasons[begin + place] = (MotionReason.MOTION_UNFAMILIAR, *reasons[begin + place])
                 if steps is not None:
                     covariances[place] = None
-        poses = list(map(recorded, rows.poses[ends].tolist()))
+        x, y, z, *q = rows.poses[ends].T.tolist()
+        given = map(RecordedPose, zip(x, y, z, strict=True), zip(*q, strict=True))
+        poses = [None if math.isnan(first) else pose for first, pose in zip(x, given, strict=True)]
         yield from map(
             MotionRecord,
             ends.tolist(),

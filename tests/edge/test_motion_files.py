@@ -217,6 +217,17 @@ def test_lone_labels_move_nothing(plain: MotionCalibration) -> None:
             assert (update.covered[1] is None) == (place < 16)
 
 
+def test_truths_without_errors_leave_a_twentieth(plain: MotionCalibration) -> None:
+    """As of a robot that stands; the next error is not missed for long."""
+    pair = drive(90, 600)
+    tracker = MotionTracker(plain, adapt=True)
+    for stamp, pose in zip(pair.stamps_ns.tolist(), pair.estimate, strict=True):
+        record = tracker.step(stamp, pose)
+        update = tracker.observe(stamp, pose)
+    assert update.factor[0] == pytest.approx([1 / 20] * 8)
+    assert record.motion[0].factor == pytest.approx([1 / 20] * 8)
+
+
 def test_labels_need_a_tracker_that_adapts(calibration: MotionCalibration) -> None:
     pair = drive(1, 30)
     tracker = MotionTracker(calibration)
