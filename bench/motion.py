@@ -10,13 +10,16 @@ learned on all others. Results: ``results/motion/SET.json``.
 drives of which at least 90 % is inside, and the width over that of ``hierarchical``; ``hardest``
 the coverage in the quarter of a drive's motions with the largest predicted scale. ``injected``:
 what is found of a time offset, a turned body frame and a scale that were put in, beyond what is
-found without. Times are processor time of this process.
+found without. Times are processor time of this process. Memory is the peak of a process of its own,
+which reads all files, beyond that of its imports; ``annotate`` of the longest drive.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -33,13 +36,15 @@ from cvo_edge.motion.annotation import annotate
 from cvo_edge.motion.audit import RecordingAudit, audit
 from cvo_edge.motion.conformalize import conformalize
 from cvo_edge.motion.corrections import fit_of
-from cvo_edge.motion.format import MotionFile, encode_motion_file
+from cvo_edge.motion.format import MotionFile, encode_motion_file, read_motion_file
 from cvo_edge.motion.intervals import Level, MotionCalibration, MotionWindow
 from cvo_edge.motion.pairs import Pair
 from cvo_edge.motion.recordings import trace_of
 from cvo_edge.motion.relative import motion, norms, residual
 from cvo_edge.motion.thresholds import Scores
+from cvo_edge.motion.tracker import MotionTracker
 from cvo_edge.motion.windows import window_errors
+from cvo_edge.programs.measure import memory_mib
 from cvo_edge.programs.trajectories import Files, Reading, correct_pairs, fits, read_pairs
 from cvo_edge.spread import Here
 from cvo_edge.vocabulary import MOTION_RULES, MotionCorrection
@@ -365,8 +370,38 @@ def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def costs(pairs: Sequence[Pair]) -> dict[str, Any]:
-    """Return processor times and the size of the file."""
+def peak_mib(step: str, name: str) -> float:
+    """Return by how much memory grows at most, beyond imports, in a process of its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_peak_mib, (step, name))
+
+
+def _peak_mib(step: str, name: str) -> float:
+    # What a calibration imports and allocates once is no part of its cost.
+    before = memory_mib()["peak_rss"]
+    pairs = SETS[name][0]()
+    if step == "conformalize":
+        conformalize(Here(pairs), "bench")
+    else:
+        calibration = MotionCalibration(read_motion_file(Path(step)))
+        pair = max(pairs, key=lambda each: len(each.stamps_ns))
+        for _ in annotate(calibration, Level(), pair.stamps_ns, pair.estimate, {}):
+            pass
+    return memory_mib()["peak_rss"] - before
+
+
+def step_us(calibration: MotionCalibration, pair: Pair) -> float:
+    """Return the median time of a step of the tracker over a drive, of this process alone."""
+    tracker, times = MotionTracker(calibration), []
+    for stamp_ns, pose in zip(pair.stamps_ns.tolist(), pair.estimate, strict=True):
+        start = time.process_time_ns()
+        tracker.step(stamp_ns, pose)
+        times.append(time.process_time_ns() - start)
+    return 1e-3 * float(np.median(times))
+
+
+def costs(name: str, pairs: Sequence[Pair]) -> dict[str, Any]:
+    """Return processor times, memory and the size of the file."""
     start = time.process_time()
     file: MotionFile = conformalize(Here(pairs), "bench")
     learned_s = time.process_time() - start
@@ -377,11 +412,19 @@ def costs(pairs: Sequence[Pair]) -> dict[str, Any]:
         for pair in pairs
         for _ in annotate(calibration, Level(), pair.stamps_ns, pair.estimate, {})
     )
+    annotate_us = 1e6 * (time.process_time() - start) / count
+    content = encode_motion_file(file)
+    with tempfile.NamedTemporaryFile() as written:
+        Path(written.name).write_bytes(content)
+        annotate_mib = peak_mib(written.name, name)
     return {
         "poses": count,
         "conformalize_s": learned_s,
-        "annotate_us": 1e6 * (time.process_time() - start) / count,
-        "bytes": len(encode_motion_file(file)),
+        "conformalize_mib": peak_mib("conformalize", name),
+        "annotate_us": annotate_us,
+        "annotate_mib": annotate_mib,
+        "step_us": step_us(calibration, pairs[0]),
+        "bytes": len(content),
     }
 
 
@@ -402,7 +445,7 @@ def main() -> None:
             "alignment": alignments(pairs),
             "injected": injected(corrected),
             **left_out(corrected),
-            "costs": costs(corrected),
+            "costs": costs(name, corrected),
         }
         write_result(RESULTS / "motion" / f"{name}.json", report)
 
