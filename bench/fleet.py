@@ -4,7 +4,8 @@
 
 Recordings are made of steps of the KITTI LiDAR odometry in ``CVO_DATA/trajectories``: blocks of 50
 to 250 steps of truth and error, drawn with a seed, half of them mirrored, the errors of each
-recording times a factor of its own; 2,300 poses each. FOLDER gets the files (0.4 GB a thousand).
+recording times a factor of its own; 2,300 poses each. FOLDER gets the files (0.4 GB a thousand),
+unless it has them already.
 
 The cluster is a head with two cores on this machine. Once 30 % of the alignments are done, the
 worker that a task reports is killed in the middle of another one. Both files have to be equal.
@@ -83,8 +84,8 @@ def drawn(
     return np.concatenate(steps)[cut], factor * np.concatenate(errors)[cut]
 
 
-def write(folder: Path, count: int) -> Path:
-    """Write recordings; return the list of their files."""
+def write(folder: Path, count: int) -> None:
+    """Write recordings, then the list of their files."""
     nothing = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     sources = []
     for pair in kitti():
@@ -96,7 +97,6 @@ def write(folder: Path, count: int) -> Path:
     true = exp(np.array([steps for steps, _ in parts]))
     # With x of dE^-1 dG, dE is dG Exp(x)^-1.
     back = motion(exp(np.array([off for _, off in parts])), nothing)
-    listed = folder / "pairs.txt"
     stamps = np.arange(POSES) / FPS
     names = [(f"{index:04d}.tum", f"{index:04d}-truth.tum") for index in range(count)]
     for place in (0, 1):
@@ -108,8 +108,7 @@ def write(folder: Path, count: int) -> Path:
         for index, name in enumerate(names):
             table = np.column_stack([stamps, poses[:, index]])
             np.savetxt(folder / name[place], table, fmt="%.9f")
-    listed.write_text("".join(f"{' '.join(name)}\n" for name in names))
-    return listed
+    (folder / "pairs.txt").write_text("".join(f"{' '.join(name)}\n" for name in names))
 
 
 def driver(listed: Path, output: Path, address: str | None) -> None:
@@ -241,7 +240,9 @@ def main() -> None:
         driver(listed, given.driver, given.address)
         return
     given.folder.mkdir(parents=True, exist_ok=True)
-    listed = write(given.folder, given.recordings)
+    known = listed.read_text().splitlines() if listed.exists() else []
+    if len(known) != given.recordings:
+        write(given.folder, given.recordings)
     local, ray = given.folder / "local.json", given.folder / "ray.json"
     runs = [run(listed, local), run_on_ray(listed, ray)]
     assert local.read_bytes() == ray.read_bytes(), "the files differ"

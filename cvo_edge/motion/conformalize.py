@@ -50,7 +50,7 @@ from cvo_edge.motion.recordings import (
 )
 from cvo_edge.motion.thresholds import Scores
 from cvo_edge.motion.tube_fit import fit_tube
-from cvo_edge.motion.windows import Window, anchors_of, window_errors
+from cvo_edge.motion.windows import ANCHORS, Window, anchors_of, window_errors
 from cvo_edge.spread import Spread
 from cvo_edge.vocabulary import MOTION_RULES
 
@@ -64,6 +64,8 @@ _LEAST_MOTIONS = 20
 _LEAST_APART = 200
 # The scale of a tube has seven.
 _LEAST_WINDOWS = 100
+# Anchors of a window's tube, of all recordings, and the least number for each window's length.
+_MOST_ANCHORS, _LEAST_ANCHORS = 20_000, 4
 _JOINT_LEVEL = 0.9
 _MOST_RECORDINGS = 100
 # Significant digits of coefficients and thresholds: nine horizons have to fit into 64 KiB.
@@ -291,7 +293,13 @@ def _window(
     needed: bool,
 ) -> WindowSpec | None:
     """Calibrate a window; without enough drives for it, return None or, if needed, raise."""
-    every = recordings.map(partial(_window_errors, window=window), what=f"window {window}")
+    lengths = recordings.map(partial(extent, horizon=window)).collect()
+    # Windows overlap, and hold as many numbers as all horizons together: of a thousand drives,
+    # fewer anchors say as much.
+    wanted = round(_MOST_ANCHORS * window.value / max(sum(lengths), window.value))
+    wanted = min(ANCHORS, max(_LEAST_ANCHORS, wanted))
+    measured = partial(_window_errors, window=window, anchors=wanted)
+    every = recordings.map(measured, what=f"window {window}")
     anchors = every.map(anchors_of, what=f"window {window}").collect()
     used = [index for index, count in enumerate(anchors) if count]
     own = [groups[index] for index in used]
@@ -299,7 +307,6 @@ def _window(
         if needed:
             raise _too_short("window", window, recordings)
         return None
-    lengths = recordings.map(partial(extent, horizon=window)).collect()
     apart = sum(lengths[index] for index in used) / window.value
     tube = fit_tube(window, every.take(used), own, learned and apart >= _LEAST_WINDOWS)
     table = Scores(tube.scores, own).table(MOTION_RULES, LEVELS)
@@ -327,8 +334,8 @@ def _scale(scale: Scale) -> ScaleSpec:
     )
 
 
-def _window_errors(recording: Recording, window: Horizon) -> Window:
-    return window_errors(*recording, window)
+def _window_errors(recording: Recording, window: Horizon, anchors: int) -> Window:
+    return window_errors(*recording, window, anchors)
 
 
 def _recording(pair: About, size: Size) -> RecordingSpec:

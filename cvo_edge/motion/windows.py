@@ -28,7 +28,8 @@ from cvo_edge.motion.trace import Rows, tube_numbers
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-_ANCHORS = 20
+# Anchors a window.
+ANCHORS = 20
 # So many motions are in the processor's cache at once.
 _AT_ONCE = 4096
 _RAISED = 0.2
@@ -69,13 +70,13 @@ class Window(NamedTuple):
         return np.asarray(steps / np.maximum(np.add.reduceat(steps, begin), 1e-12)[self.anchor])
 
 
-def window_errors(rows: Rows, truth: Array, window: Horizon) -> Window:
-    """Return the errors after anchors a twentieth of a window apart, of windows that are whole.
+def window_errors(rows: Rows, truth: Array, window: Horizon, anchors: int = ANCHORS) -> Window:
+    """Return the errors after anchors, so many a window, of windows that are whole.
 
     A window ends where the trajectory breaks, and is whole if it reaches its end before that.
     """
     along = window.along(rows.stamps_ns, rows.path_m)
-    apart = window.value / _ANCHORS
+    apart = window.value / anchors
     first = np.unique(np.searchsorted(along, np.arange(along[0], along[-1], apart)))
     last = np.searchsorted(along, along[first] + window.value, side="right")
     inside = last < len(along)
