@@ -7,12 +7,14 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 
 from cvo_edge import geometry
 from cvo_edge.camera import Camera
 from cvo_edge.estimate import Status
 from cvo_edge.frontend.steps import Step, StepReason
+from cvo_edge.motion.records import MotionHeader, MotionInterval, MotionReason, MotionRecord
 from cvo_edge.output.sinks import tum_line
 from cvo_edge.trajectories.tum import FORM
 from cvo_edge.vocabulary import VERSION
@@ -36,12 +38,15 @@ class StepHeader(
         The camera.
     scale
         The trajectory that lengths of steps come from; null: steps have none.
+    motion
+        No key without ``--motion``: the calibration of the intervals, and what they promise.
     """
 
     schema_version: Literal[1] = 1
     software: str = f"cvo-edge {VERSION}"
     camera: Camera
     scale: str | None
+    motion: MotionHeader | UnsetType = UNSET
 
 
 class StepRecord(Struct, frozen=True, forbid_unknown_fields=True):
@@ -66,13 +71,16 @@ class StepRecord(Struct, frozen=True, forbid_unknown_fields=True):
     rotation_deviation, direction_deviation
         Standard deviations (rad) by the curvature of the loss: too small by factors, but larger
         where errors are larger.
+    motion, novelty
+        No keys without ``--motion``: intervals on the motion over each calibrated horizon, as
+        ``annotate`` gives them for the steps added up.
     """
 
     seq: int
     stamp_ns: int | None
     source: str
     status: Status
-    reasons: tuple[StepReason, ...]
+    reasons: tuple[StepReason | MotionReason, ...]
     q_xyzw: tuple[float, float, float, float] | None
     direction: tuple[float, float, float] | None
     length_m: float | None
@@ -81,6 +89,34 @@ class StepRecord(Struct, frozen=True, forbid_unknown_fields=True):
     inliers: int
     rotation_deviation: float | None
     direction_deviation: float | None
+    motion: tuple[MotionInterval, ...] | UnsetType = UNSET
+    novelty: float | UnsetType | None = UNSET
+
+
+# The front end says itself that a step is lost or the first one.
+_SAID = (MotionReason.POSE_MISSING, MotionReason.TRAJECTORY_STARTED)
+
+
+def with_intervals(record: StepRecord, found: MotionRecord) -> StepRecord:
+    """Return a record with the intervals on the motions that end at its frame."""
+    more = tuple(each for each in found.reasons if each not in _SAID)
+    return replace(
+        record,
+        status=found.status,
+        reasons=(*record.reasons, *more),
+        motion=found.motion,
+        novelty=found.novelty,
+    )
+
+
+def columns_of(step: Step) -> dict[str, float]:
+    """Return the columns of a step, by which intervals may be scaled; nan for a lost one."""
+    numbers: tuple[float, ...] = _NO_STEP
+    if (motion := step.motion) is not None:
+        numbers = (float(motion.inliers), motion.parallax_px, *motion.deviations)
+    elif np.isnan(step.pose[0]):
+        numbers = (math.nan,) * len(COLUMNS)
+    return dict(zip(COLUMNS, numbers, strict=True))
 
 
 def record_of(step: Step) -> StepRecord:
@@ -107,14 +143,14 @@ def record_of(step: Step) -> StepRecord:
     )
 
 
-def json_heading(camera: Camera, scale: str | None) -> bytes:
+def json_heading(camera: Camera, scale: str | None, motion: MotionHeader | UnsetType) -> bytes:
     """Return the first of JSON lines."""
-    return msgspec.json.encode(StepHeader(camera=camera, scale=scale)) + b"\n"
+    return json_line(StepHeader(camera=camera, scale=scale, motion=motion))
 
 
-def json_line(step: Step) -> bytes:
-    """Return the JSON line of a step."""
-    return msgspec.json.encode(record_of(step)) + b"\n"
+def json_line(record: StepHeader | StepRecord) -> bytes:
+    """Return a JSON line."""
+    return msgspec.json.encode(record) + b"\n"
 
 
 def tum_heading(camera: Camera, scale: str | None) -> bytes:
@@ -129,11 +165,6 @@ def tum_heading(camera: Camera, scale: str | None) -> bytes:
 
 def tum_row(step: Step) -> bytes:
     """Return the line of a step with a stamp; its pose is nan if the step is lost."""
-    numbers: tuple[float, ...] = _NO_STEP
-    if (motion := step.motion) is not None:
-        numbers = (float(motion.inliers), motion.parallax_px, *motion.deviations)
-    elif np.isnan(step.pose[0]):
-        numbers = (math.nan,) * len(COLUMNS)
-    columns = " ".join(f"{number:.6g}" for number in numbers)
+    columns = " ".join(f"{number:.6g}" for number in columns_of(step).values())
     line = tum_line(step.stamp_ns or 0, step.pose).decode().rstrip("\n")
     return f"{line} {columns}\n".encode()

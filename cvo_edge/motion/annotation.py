@@ -20,6 +20,8 @@ from cvo_edge.motion.records import (
     MotionReason,
     MotionRecord,
     SinceAnchor,
+    nothing_of,
+    pointed,
     with_tube,
 )
 from cvo_edge.motion.trace import Rows, rows_of
@@ -60,6 +62,7 @@ def annotate(
     Raises UsageError if a column is missing, an anchor is no pose of the trajectory, or the
     calibration does not have the covariance.
     """
+    calibration.check_covariance(covariance)
     values = np.empty((len(stamps_ns), len(calibration.file.columns)))
     for place, name in enumerate(calibration.file.columns):
         if name not in columns:
@@ -104,7 +107,7 @@ def _records(
     reasons = _reasons(calibration, rows, differs)
     running = Running(calibration.limits.period_s)
     limit = calibration.familiar.limit
-    nothing = tuple(MotionInterval(each.spec.horizon) for each in calibration.horizons)
+    nothing = nothing_of(calibration)
     outside = tuple(SinceAnchor(each.spec.window) for each in calibration.windows)
     for begin in range(0, len(rows.part), _AT_ONCE):
         ends = np.arange(begin, min(begin + _AT_ONCE, len(rows.part)))
@@ -114,6 +117,8 @@ def _records(
             _motions(rows, ends, differs[ends], each, level, none, of_motions)
             for each, none in zip(calibration.horizons, nothing, strict=True)
         ]
+        if calibration.pointed:
+            by_horizon = [list(map(pointed, each)) for each in by_horizon]
         by_window = [
             _tube(rows, each, anchors[ends], ends, level, none)
             for each, none in zip(calibration.windows, outside, strict=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from msgspec import Struct
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.motion.covariance import CHI_SQUARE, SPANS_S, nees, sums_of
+from cvo_edge.motion.direction import angles, check_same
 from cvo_edge.motion.drift import Running
 from cvo_edge.motion.intervals import (
     Intervals,
@@ -44,6 +46,10 @@ class HorizonAudit(Struct, frozen=True):
     nees, nees_inside
         Mean NEES of the covariance ``interval`` over six, and the share up to the chi-square
         quantile at 0.9, whatever the confidence.
+    directions
+        null but for an estimator without a scale: the number of motions with a direction.
+        ``position`` and the first of ``radii`` (rad) are then about these; ``dof``, ``joint`` and
+        ``half_widths`` are about the three degrees of freedom of rotation; NEES are 0.
     """
 
     horizon: str
@@ -56,6 +62,7 @@ class HorizonAudit(Struct, frozen=True):
     radii: tuple[float, float]
     nees: float
     nees_inside: float
+    directions: int | None = None
 
 
 class NeesAudit(Struct, frozen=True):
@@ -141,8 +148,11 @@ class Audit(Struct, frozen=True):
         That of the degrees of freedom in the marginal scope, that of all six in the joint one.
         """
         joint = self.scope == "joint"
-        found = [each.joint if joint else float(np.mean(each.dof)) for each in self.over(horizon)]
-        return float(np.mean(found)) if found else None
+        every = self.over(horizon)
+        found = [each.joint if joint else float(np.mean(each.dof)) for each in every]
+        pointed = [each.position for each in every if each.directions]
+        shares = [float(np.mean(each)) for each in (found, pointed) if each]
+        return min(shares, default=None)
 
 
 def audit(calibration: MotionCalibration, level: Level, pairs: Sequence[Pair]) -> Audit:
@@ -152,19 +162,22 @@ def audit(calibration: MotionCalibration, level: Level, pairs: Sequence[Pair]) -
     motion over any horizon.
     """
     recordings, known = [], []
+    measure = _pointed_horizon if calibration.pointed else _horizon
     for pair in pairs:
+        check_same(pair.name, pair.unscaled, calibration.pointed)
         missing = [name for name in calibration.file.columns if name not in pair.columns]
         if missing:
             raise UsageError(f"{pair.name}: expected the column {missing[0]}, found none")
         rows = trace_of(scaled(calibration, pair), calibration.limits, calibration.file.columns)
-        if _known(calibration, rows):
+        # Paths of steps of length 1 are as long as others.
+        if not calibration.pointed and _known(calibration, rows):
             known.append(pair.name)
         truth, differs = pair.truth, calibration.other_rate(rows.stamps_ns)
         given = _given(calibration, rows)
         ends = np.flatnonzero(given)
         in_frames = np.flatnonzero(given & ~differs)
         horizons = [
-            _horizon(
+            measure(
                 each,
                 each.intervals(rows, level, in_frames if each.horizon.unit == "f" else ends),
                 truth,
@@ -260,6 +273,37 @@ def _integrated(
 
 def _nees(values: Array) -> tuple[float, float]:
     return float(values.mean()) / 6.0, float((values <= CHI_SQUARE).mean())
+
+
+def _pointed_horizon(horizon: MotionHorizon, found: Intervals, truth: Array) -> HorizonAudit:
+    """Return the figures of an estimator without a scale."""
+    true = motion(truth[found.start], truth[found.end])
+    off = residual(found.moved, true)[:, 3:]
+    known = np.isfinite(off).all(axis=1)
+    off, angle = off[known], angles(found.moved, true)[known]
+    lower, upper, radii = found.lower[known, 3:], found.upper[known, 3:], found.radii[known]
+    inside = (lower <= off) & (off <= upper)
+    pointed = np.isfinite(angle)
+    turned = np.linalg.norm(off - found.bias[known, 3:], axis=1)
+    return HorizonAudit(
+        horizon.spec.horizon,
+        len(off),
+        tuple(_means(inside, 3)),
+        _means(np.atleast_2d(inside.all(axis=1)).T, 1)[0],
+        _means((angle <= radii[:, 0])[pointed, np.newaxis], 1)[0],
+        _means((turned <= radii[:, 1])[:, np.newaxis], 1)[0],
+        tuple(_means(0.5 * (upper - lower), 3)),
+        (_means(radii[pointed, :1], 1)[0], _means(radii[:, 1:], 1)[0]),
+        0.0,
+        0.0,
+        int(pointed.sum()),
+    )
+
+
+def _means(values: NDArray[Any], columns: int) -> list[float]:
+    """Return the means over rows; zeros without any."""
+    means: list[float] = (values.mean(axis=0) if len(values) else np.zeros(columns)).tolist()
+    return means
 
 
 def _horizon(horizon: MotionHorizon, found: Intervals, truth: Array) -> HorizonAudit:

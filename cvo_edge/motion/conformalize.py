@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -17,9 +17,17 @@ from cvo_edge.motion.covariance import (
     fit_shape,
     sums_of,
 )
+from cvo_edge.motion.direction import COLUMN as DIRECTION
+from cvo_edge.motion.direction import (
+    angles,
+    check_same,
+    check_without_metres,
+    directions,
+    fit_direction,
+    rotations,
+)
 from cvo_edge.motion.drift import fit_familiar
 from cvo_edge.motion.errors import Errors, errors_of
-from cvo_edge.motion.fitting import Scale
 from cvo_edge.motion.format import (
     LEVELS,
     CorrectionSpec,
@@ -28,7 +36,6 @@ from cvo_edge.motion.format import (
     LimitsSpec,
     MotionFile,
     RecordingSpec,
-    ScaleSpec,
     ThresholdSpec,
     TubeThresholdSpec,
     WindowSpec,
@@ -48,6 +55,7 @@ from cvo_edge.motion.recordings import (
     recording_of,
     size_of,
 )
+from cvo_edge.motion.rounding import EXACT, numbers_of, rounded, scale_of, thresholds_of
 from cvo_edge.motion.thresholds import Scores
 from cvo_edge.motion.tube_fit import fit_tube
 from cvo_edge.motion.windows import ANCHORS, Window, anchors_of, window_errors
@@ -68,8 +76,6 @@ _LEAST_WINDOWS = 100
 _MOST_ANCHORS, _LEAST_ANCHORS = 20_000, 4
 _JOINT_LEVEL = 0.9
 _MOST_RECORDINGS = 100
-# Significant digits of coefficients and thresholds: nine horizons have to fit into 64 KiB.
-_COARSE, _FINE, _EXACT = 4, 5, 9
 
 
 def conformalize(
@@ -107,6 +113,14 @@ def conformalize(
         enough for a horizon or a window.
     """
     known = pairs.map(about).collect()
+    pointed = known[0].unscaled
+    for each in known:
+        check_same(each.name, each.unscaled, pointed)
+    defaults, tubes_wanted = DEFAULT_HORIZONS, DEFAULT_WINDOWS if windows is None else windows
+    if pointed:
+        check_without_metres(horizons, windows)
+        defaults = tuple(each for each in defaults if each.unit != "m")
+        tubes_wanted = ()
     # The order of recordings must not change the file: sums of floats depend on it.
     order = sorted(range(len(known)), key=lambda place: (known[place].group, known[place].name))
     known, pairs = [known[place] for place in order], pairs.take(order)
@@ -129,21 +143,26 @@ def conformalize(
     sizes = recordings.map(size_of).collect()
     specs = [
         found
-        for horizon in (DEFAULT_HORIZONS if horizons is None else horizons)
-        if (found := _horizon(horizon, recordings, groups, learned, needed=horizons is not None))
+        for horizon in (defaults if horizons is None else horizons)
+        if (
+            found := _horizon(
+                horizon, recordings, groups, learned, needed=horizons is not None, pointed=pointed
+            )
+        )
     ]
     tubes = [
         tube
-        for window in (DEFAULT_WINDOWS if windows is None else windows)
+        for window in tubes_wanted
         if (tube := _window(window, recordings, groups, learned, needed=windows is not None))
     ]
     if not specs:
         raise UsageError(
             "conformalize: expected recordings that are long enough for a horizon of "
-            f"{', '.join(map(str, DEFAULT_HORIZONS))}, found none; name shorter ones"
+            f"{', '.join(map(str, defaults))}, found none; name shorter ones"
         )
     return MotionFile(
         name=name,
+        translation="direction" if pointed else "metres",
         limits=LimitsSpec(
             period_s=limits.period_s, gap_s=limits.gap_s, speed=limits.speed, turn=limits.turn
         ),
@@ -152,7 +171,9 @@ def conformalize(
         groups=drives,
         recordings=tuple(map(_recording, known[:_MOST_RECORDINGS], sizes)),
         familiar=_familiar(recordings, limits.period_s),
-        integrated=_integrated(specs, recordings, groups, sum(size.rows for size in sizes)),
+        integrated=None
+        if pointed
+        else _integrated(specs, recordings, groups, sum(size.rows for size in sizes)),
         horizons=tuple(specs),
         windows=tuple(tubes),
     )
@@ -182,10 +203,13 @@ def _horizon(
     learned: bool,
     *,
     needed: bool,
+    pointed: bool,
 ) -> HorizonSpec | None:
     """Calibrate a horizon; without enough drives for it, return None or, if needed, raise."""
     # Only one horizon's errors are kept at a time.
-    measured = recordings.map(partial(_errors, horizon=horizon), what=f"horizon {horizon}")
+    translation = angles if pointed else None
+    own_errors = partial(_errors, horizon=horizon, translation=translation)
+    measured = recordings.map(own_errors, what=f"horizon {horizon}")
     lengths = recordings.map(partial(extent, horizon=horizon)).collect()
     counts = measured.map(_motions, what=f"horizon {horizon}").collect()
     used = [index for index, count in enumerate(counts) if count >= _LEAST_MOTIONS]
@@ -196,35 +220,53 @@ def _horizon(
         return None
     errors = measured.take(used)
     apart = sum(lengths[index] for index in used) / horizon.value
-    crossed = fit_horizon(errors, own, learned and apart >= _LEAST_APART)
+    learned = learned and apart >= _LEAST_APART
+    both, errors = errors, errors.map(rotations) if pointed else errors
+    crossed = fit_horizon(errors, own, learned)
     scores = Scores(crossed.scaled.map(_scores).collect(), own).table(MOTION_RULES, LEVELS)
     unit = scores[MOTION_RULES.index("mean"), LEVELS.index(_JOINT_LEVEL), :6]
     unit = np.maximum(unit, 1e-9)
     joint = Scores(crossed.scaled.map(partial(_joint, unit=unit)).collect(), own)
     q = np.concatenate([scores, joint.table(MOTION_RULES, LEVELS)], axis=2)
-    bias, scale = crossed.fit
+    fit = crossed.fit
     shape = fit_shape(crossed.scaled.map(_residuals), own).matrix
-    usual = np.mean(errors.map(partial(_usual, fit=crossed.fit)).collect(), axis=0)
+    usual = np.mean(errors.map(partial(_usual, fit=fit)).collect(), axis=0)
+    if pointed:
+        fit, usual[DIRECTION], q[:, :, DIRECTION] = fit_direction(
+            both.map(directions),
+            own,
+            fit,
+            MOTION_RULES,
+            LEVELS,
+            learned=learned,
+            least=_LEAST_MOTIONS,
+        )
+        q[:, :, :3] = np.inf
+    bias, scale = fit
     return HorizonSpec(
         horizon=str(horizon),
         recordings=len(set(own)),
         motions=sum(counts[index] for index in used),
-        bias=None if bias is None else tuple(map(_numbers, bias)),
-        scale=None if scale is None else _scale(scale),
-        joint=_numbers(unit),
+        bias=None if bias is None else tuple(map(numbers_of, bias)),
+        scale=None if scale is None else scale_of(scale),
+        joint=numbers_of(unit),
         # Rounded, a nearly singular matrix might no longer be positive definite.
-        shape=tuple(_rounded(value, _EXACT) for value in shape[np.tril_indices(6)].tolist()),
-        usual=_numbers(usual),
+        shape=tuple(rounded(value, EXACT) for value in shape[np.tril_indices(6)].tolist()),
+        usual=numbers_of(usual),
         thresholds=tuple(
-            ThresholdSpec(rule=rule, confidence=level, q=_thresholds(each))
+            ThresholdSpec(rule=rule, confidence=level, q=thresholds_of(each))
             for rule, row in zip(MOTION_RULES, q, strict=True)
             for level, each in zip(LEVELS, row, strict=True)
         ),
     )
 
 
-def _errors(recording: Recording, horizon: Horizon) -> Errors:
-    return errors_of(*recording, horizon)
+def _errors(
+    recording: Recording,
+    horizon: Horizon,
+    translation: Callable[[Array, Array], Array] | None,
+) -> Errors:
+    return errors_of(*recording, horizon, translation)
 
 
 def _motions(errors: Errors) -> int:
@@ -252,9 +294,9 @@ def _familiar(recordings: Spread[Recording], period_s: float) -> FamiliarSpec:
     found = fit_familiar(recordings, period_s)
     # Rounded numbers give slightly other values: the limit must not exclude the drive behind it.
     return FamiliarSpec(
-        mean=_numbers(found.mean),
-        spread=_numbers(found.spread),
-        limit=_rounded(1.01 * found.limit + 1e-6),
+        mean=numbers_of(found.mean),
+        spread=numbers_of(found.spread),
+        limit=rounded(1.01 * found.limit + 1e-6),
     )
 
 
@@ -273,7 +315,7 @@ def _integrated(
     used = [index for index, each in enumerate(sums) if all(len(one.residuals) for one in each)]
     if len({groups[index] for index in used}) < 2:
         return None
-    a, b, c, d, e, f = _numbers(
+    a, b, c, d, e, f = numbers_of(
         fit_factors([sums[index] for index in used], [groups[index] for index in used])
     )
     return a, b, c, d, e, f
@@ -314,23 +356,15 @@ def _window(
         window=str(window),
         recordings=len(set(own)),
         anchors=sum(anchors),
-        scale=_scale(tube.scale),
-        unit=_numbers(tube.unit),
-        usual=_numbers(tube.usual),
+        scale=scale_of(tube.scale),
+        unit=numbers_of(tube.unit),
+        usual=numbers_of(tube.usual),
         thresholds=tuple(
             TubeThresholdSpec(rule=rule, confidence=level, q=(position, rotation, six))
             for rule, row in zip(MOTION_RULES, table, strict=True)
             for level, each in zip(LEVELS, row, strict=True)
-            for position, rotation, six in [_thresholds(each)]
+            for position, rotation, six in [thresholds_of(each)]
         ),
-    )
-
-
-def _scale(scale: Scale) -> ScaleSpec:
-    return ScaleSpec(
-        coefficients=tuple(map(_numbers, scale.coefficients)),
-        lowest=_numbers(scale.lowest),
-        highest=_numbers(scale.highest),
     )
 
 
@@ -343,22 +377,6 @@ def _recording(pair: About, size: Size) -> RecordingSpec:
         name=pair.name,
         group=pair.group,
         poses=size.poses,
-        seconds=_rounded(size.seconds),
-        metres=_rounded(size.metres),
+        seconds=rounded(size.seconds),
+        metres=rounded(size.metres),
     )
-
-
-def _thresholds(values: Array) -> tuple[float | None, ...]:
-    # Rounded up: rounding must not exclude a score.
-    return tuple(
-        _rounded(q * (1.0 + 10.0 ** (1 - _FINE)) + 1e-12, _FINE) if np.isfinite(q) else None
-        for q in values.tolist()
-    )
-
-
-def _numbers(values: Array) -> tuple[float, ...]:
-    return tuple(map(_rounded, values.tolist()))
-
-
-def _rounded(value: float, digits: int = _COARSE) -> float:
-    return float(f"{value:.{digits}g}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -54,12 +55,24 @@ def recent_rows(rows: Rows, ends: Integers) -> Integers:
     return np.maximum(since, np.searchsorted(rows.part, rows.part[ends]))
 
 
-def errors_of(rows: Rows, truth: Array, horizon: Horizon) -> Errors:
-    """Return the errors over a horizon; ``truth`` (n, 7) is NaN where it is not known."""
+def errors_of(
+    rows: Rows,
+    truth: Array,
+    horizon: Horizon,
+    translation: Callable[[Array, Array], Array] | None = None,
+) -> Errors:
+    """Return the errors over a horizon; ``truth`` (n, 7) is NaN where it is not known.
+
+    ``translation`` gives the first residual, in place of three, by estimated and true motions.
+    """
     start, end, recent = motions(rows, horizon)
     known = np.isfinite(truth[start]).all(axis=1) & np.isfinite(truth[end]).all(axis=1)
     start, end, recent = start[known], end[known], recent[known]
     moved, numbers = motion_numbers(rows, start, end)
     sizes = scale_numbers(rows, start, end, recent)
-    off = residual(moved, motion(truth[start], truth[end]))
+    true = motion(truth[start], truth[end])
+    off = residual(moved, true)
+    if translation is not None:
+        off[:, :3] = 0.0
+        off[:, 0] = translation(moved, true)
     return Errors(end, numbers, sizes, off)

@@ -17,7 +17,8 @@ seconds, one a line (``times.txt``), or a rate gives them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,6 +63,8 @@ class Poses(NamedTuple):
         What the file holds without giving a pose, as text.
     timed
         Whether the stamps were given, as the file has none.
+    unscaled
+        Whether steps have no length, by a comment ``# scale: none``; see ``direction``.
     """
 
     path: Path
@@ -70,6 +73,7 @@ class Poses(NamedTuple):
     columns: dict[str, Array]
     skipped: str
     timed: bool
+    unscaled: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +92,8 @@ class PoseFile:
         Shape (n,) each: other columns by name.
     skipped
         What the file holds without giving a pose, as text.
+    unscaled
+        As for ``Poses``.
     """
 
     path: Path
@@ -96,6 +102,7 @@ class PoseFile:
     poses: Array
     columns: dict[str, Array]
     skipped: str
+    unscaled: bool = False
 
     def stamped(self, times: Path | None = None, fps: float | None = None) -> Poses:
         """Return the poses with stamps, from a list or a rate if the file has none of its own.
@@ -104,7 +111,9 @@ class PoseFile:
         """
         stamps = self._stamps(times, fps)
         timed = self.own_stamps_ns is None
-        return Poses(self.path, stamps, self.poses, self.columns, self.skipped, timed)
+        return Poses(
+            self.path, stamps, self.poses, self.columns, self.skipped, timed, self.unscaled
+        )
 
     def _stamps(self, times: Path | None, fps: float | None) -> Integers:
         if self.own_stamps_ns is not None:
@@ -156,7 +165,8 @@ def read_poses(path: Path, format: TrajectoryFormat | None = None) -> PoseFile:
     columns = dict(zip(names[len(tum.FORM.split()) :], others.T, strict=True))
     if found == "openvins":
         columns = _deviations(columns)
-    return _read(path, found, trajectory, columns)
+    unscaled = any(map(says_unscaled, _comments(path)))
+    return replace(_read(path, found, trajectory, columns), unscaled=unscaled)
 
 
 def _format(path: Path, line: str) -> TrajectoryFormat | None:
@@ -168,11 +178,23 @@ def _format(path: Path, line: str) -> TrajectoryFormat | None:
 def _named(path: Path) -> list[str]:
     """Return the names of more columns than TUM's, from the comment before the first row."""
     names: list[str] = []
-    for line in read_text(path, _FORMS).splitlines():
-        if line.strip() and not line.lstrip().startswith("#"):
-            break
+    for line in _comments(path):
         names = tum_names(line) or names
     return names if " ".join(names) != OPENVINS_FORM else []
+
+
+def _comments(path: Path) -> Iterator[str]:
+    """Yield the lines before the first row."""
+    for line in read_text(path, _FORMS).splitlines():
+        if line.strip() and not line.lstrip().startswith("#"):
+            return
+        yield line
+
+
+def says_unscaled(comment: str) -> bool:
+    """Whether a comment says that steps have no length: ``# scale: none``."""
+    words = comment.lstrip(" #").replace(",", " ").split()
+    return words[:2] == ["scale:", "none"]
 
 
 def tum_names(comment: str) -> list[str]:

@@ -145,6 +145,9 @@ class MotionFile(_Strict, frozen=True, kw_only=True):
         What the file is, and the program that wrote it.
     name
         Estimator and vehicle, in the words of who calibrated.
+    translation
+        ``direction``: the estimator has no scale. Numbers of position are then angles in rad
+        between directions, and those of tx, ty and tz mean nothing, see ``direction``.
     limits, correction
         See there.
     columns
@@ -166,6 +169,7 @@ class MotionFile(_Strict, frozen=True, kw_only=True):
     digest: Sha256 = UNWRITTEN
     software: Text = f"cvo-edge {VERSION}"
     name: Text
+    translation: Literal["metres", "direction"] = "metres"
     limits: LimitsSpec
     correction: CorrectionSpec
     columns: tuple[Text, ...]

@@ -109,10 +109,13 @@ class _Models(NamedTuple):
     scales: tuple[Scale, Scale]
 
 
-def fit_horizon(errors: Spread[Errors], groups: Sequence[str], learned: bool) -> Crossed:
+def fit_horizon(
+    errors: Spread[Errors], groups: Sequence[str], learned: bool, *, biased: bool = True
+) -> Crossed:
     """Fit the recordings of several groups.
 
     ``learned`` False: without bias and scale, because there is too little to learn them from.
+    ``biased`` False: never with a bias.
     """
     if not learned:
         plain = errors.map(_plain)
@@ -135,6 +138,8 @@ def fit_horizon(errors: Spread[Errors], groups: Sequence[str], learned: bool) ->
         for each in _VARIANTS
     ]
     costs = np.mean(tried.map(partial(_costs, thresholds=thresholds)).collect(), axis=0)
+    if not biased:
+        costs[[each for each, _ in _VARIANTS]] = np.inf
     chosen = tuple(_choice(costs[:, half]) for half in HALVES)
     whole = _Models(bias, (scales[0][1], scales[1][1]))
     return Crossed(_kept(whole, chosen), tried.map(partial(_joined, chosen=chosen)), chosen)

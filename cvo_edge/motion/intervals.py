@@ -257,6 +257,19 @@ class MotionCalibration:
             return poses
         return np.concatenate([self.file.correction.scale * poses[:, :3], poses[:, 3:]], axis=1)
 
+    def check_covariance(self, covariance: str | None) -> None:
+        """Raise UsageError for a covariance of an estimator without a scale."""
+        if covariance is not None and self.pointed:
+            raise UsageError(
+                "covariance: expected a calibration in metres, found one of an estimator without "
+                "a scale"
+            )
+
+    @property
+    def pointed(self) -> bool:
+        """Whether the estimator has no scale, see ``direction``."""
+        return self.file.translation == "direction"
+
     @property
     def steps(self) -> int:
         """The place of the horizon that covariances ``integrated`` need.
@@ -290,6 +303,12 @@ class MotionCalibration:
 
     def statement(self, level: Level) -> str:
         """Return in one sentence what intervals at a level promise."""
+        stated = self._of_motions(level)
+        if self.pointed:
+            return f"{stated}; directions count where there is one"
+        return stated
+
+    def _of_motions(self, level: Level) -> str:
         percent, groups = f"{100.0 * level.confidence:g} %", self.file.groups
         missed = f"{100.0 * (1.0 - level.confidence):.3g} %"
         if level.rule == "tolerance":

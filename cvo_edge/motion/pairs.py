@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import geometry
-from cvo_edge.errors import SourceError
+from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.motion.alignment import Alignment, align
 from cvo_edge.motion.files import Poses
 from cvo_edge.trajectories.interpolation import Track
@@ -44,6 +44,8 @@ class Pair:
         body frame to the truth's. Zero and None unless they are corrected.
     timed
         Whether one of the files has no times of its own.
+    unscaled
+        Whether the estimate's steps have no length, see ``direction``.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Pair:
     offset_ns: int = 0
     turn: Array | None = None
     timed: bool = False
+    unscaled: bool = False
 
     @property
     def truth(self) -> Array:
@@ -86,8 +89,20 @@ def pair_of(name: str, group: str, estimate: Poses, truth: Poses) -> Pair:
         )
     track = Track(truth.stamps_ns, truth.poses)
     timed = estimate.timed or truth.timed
+    if truth.unscaled:
+        raise UsageError(
+            f"{truth.path}: expected a truth in metres, found a comment # scale: none; the "
+            "estimate comes first"
+        )
     pair = Pair(
-        name, group, estimate.stamps_ns, estimate.poses, estimate.columns, track, timed=timed
+        name,
+        group,
+        estimate.stamps_ns,
+        estimate.poses,
+        estimate.columns,
+        track,
+        timed=timed,
+        unscaled=estimate.unscaled,
     )
     both = np.isfinite(np.concatenate([pair.truth, pair.estimate], axis=1)).all(axis=1)
     if both.sum() < LEAST_POSES:

@@ -26,12 +26,14 @@ class About(NamedTuple):
 
     ``columns``: names of the estimate's columns. ``reached``: usual and longest time between poses
     (s), highest speed (m/s) and turn rate (rad/s), each but for a thousandth of the poses.
+    ``unscaled``: whether the estimate's steps have no length; the speed is then one step's.
     """
 
     name: str
     group: str
     columns: tuple[str, ...]
     reached: tuple[float, float, float, float]
+    unscaled: bool
 
 
 class Recording(NamedTuple):
@@ -58,7 +60,10 @@ def about(pair: Pair) -> About:
     rates = step[np.isfinite(step).all(axis=1)] / usual_s
     speed, turn = np.quantile(rates, _NEARLY_ALL, axis=0).tolist()
     longest_s = float(np.quantile(seconds, _NEARLY_ALL))
-    return About(pair.name, pair.group, tuple(pair.columns), (usual_s, longest_s, speed, turn))
+    if pair.unscaled:
+        speed = 1.0 / usual_s
+    reached = usual_s, longest_s, speed, turn
+    return About(pair.name, pair.group, tuple(pair.columns), reached, pair.unscaled)
 
 
 def limits_of(pairs: Sequence[About]) -> Limits:

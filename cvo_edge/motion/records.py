@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from cvo_edge.estimate import RecordedPose, SixOrUnbounded, Status
@@ -17,6 +18,10 @@ from cvo_edge.vocabulary import VERSION, MotionRule, Scope
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+
+# A motion of an estimator without a scale that is shorter has no direction, in steps.
+LEAST_STEPS = 0.5
 
 
 class MotionReason(StrEnum):
@@ -33,6 +38,17 @@ class MotionReason(StrEnum):
 
 class _Strict(Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     """Immutable; unknown keys are an error. Without cycles, so that nobody need look for them."""
+
+
+class MotionDirection(_Strict, frozen=True):
+    """Where a motion leads.
+
+    ``xyz``: unit vector in the frame where the motion starts; ``radius``: angle (rad) around it
+    within which the true direction is, null if unbounded.
+    """
+
+    xyz: tuple[float, float, float]
+    radius: float | None
 
 
 class MotionInterval(_Strict, frozen=True):
@@ -59,6 +75,9 @@ class MotionInterval(_Strict, frozen=True):
     covariance
         No key unless asked for (``interval``): of the motion in the frame where it starts, x y z
         and rotations about its fixed axes, row by row, m^2, m rad and rad^2.
+    direction
+        No key unless the estimator has no scale; then ``metres``, ``t_m``, ``position`` and the
+        bounds of t are null. null if the motion has no direction.
     """
 
     horizon: str
@@ -74,6 +93,7 @@ class MotionInterval(_Strict, frozen=True):
     bounded: bool = False
     covariance: tuple[float, ...] | UnsetType | None = UNSET
     factor: tuple[float, ...] | UnsetType = UNSET
+    direction: MotionDirection | UnsetType | None = UNSET
 
 
 class SinceAnchor(_Strict, frozen=True):
@@ -188,6 +208,37 @@ def six(values: Sequence[float]) -> SixOrUnbounded:
     """Return six bounds; None for those that are infinite."""
     a, b, c, d, e, f = (value if math.isfinite(value) else None for value in values)
     return a, b, c, d, e, f
+
+
+def nothing_of(calibration: MotionCalibration) -> tuple[MotionInterval, ...]:
+    """Return what is written of each horizon where there is no motion."""
+    direction = None if calibration.pointed else UNSET
+    names = [each.spec.horizon for each in calibration.horizons]
+    return tuple(MotionInterval(name, direction=direction) for name in names)
+
+
+def pointed(motion: MotionInterval) -> MotionInterval:
+    """Return a motion of an estimator without a scale, with its direction instead of metres."""
+    if motion.t_m is None or motion.lower is None or motion.upper is None:
+        return replace(motion, direction=None)
+    length = math.hypot(*motion.t_m)
+    direction = None
+    if length >= LEAST_STEPS:
+        x, y, z = (each / length for each in motion.t_m)
+        direction = MotionDirection((x, y, z), motion.position)
+    lower, upper = (None,) * 3 + motion.lower[3:], (None,) * 3 + motion.upper[3:]
+    bounded = None not in (*lower[3:], *upper[3:], motion.rotation)
+    bounded &= direction is None or direction.radius is not None
+    return replace(
+        motion,
+        metres=None,
+        t_m=None,
+        lower=lower,
+        upper=upper,
+        position=None,
+        bounded=bounded,
+        direction=direction,
+    )
 
 
 def finite(value: float) -> float | None:

@@ -30,6 +30,8 @@ from cvo_edge.motion.records import (
     MotionRecord,
     SinceAnchor,
     finite,
+    nothing_of,
+    pointed,
     recorded,
     six,
     with_tube,
@@ -101,6 +103,11 @@ class MotionTracker:
             )
         self.calibration = calibration
         self.level = calibration.level(confidence, rule, scope)
+        calibration.check_covariance(covariance)
+        if adapt and calibration.pointed:
+            raise UsageError(
+                "adapt: expected a calibration in metres, found one of an estimator without a scale"
+            )
         self._steps = calibration.steps if covariance == "integrated" else None
         self._of_motions = covariance == "interval"
         self._adaptations = None
@@ -118,7 +125,7 @@ class MotionTracker:
         self._bounded = [
             bool(np.isfinite(each.thresholds(self.level)).all()) for each in calibration.horizons
         ]
-        self._nothing = tuple(MotionInterval(each.spec.horizon) for each in calibration.horizons)
+        self._nothing = nothing_of(calibration)
         self._outside = tuple(SinceAnchor(each.spec.window) for each in calibration.windows)
         self._seq = 0
         # By number, as rows move when old ones are dropped.
@@ -340,7 +347,7 @@ class MotionTracker:
                     UNSET if factors is None else tuple(factors[place]),
                 )
             )
-        return tuple(motions)
+        return tuple(map(pointed, motions) if self.calibration.pointed else motions)
 
     def _tubes(self) -> tuple[SinceAnchor, ...]:
         """Return the tubes at the last row."""

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.motion.annotation import annotate
-from cvo_edge.motion.files import Poses, tum_names
+from cvo_edge.motion.direction import check_same
+from cvo_edge.motion.files import Poses, says_unscaled, tum_names
 from cvo_edge.motion.format import COLUMNS
 from cvo_edge.motion.intervals import Level, MotionCalibration
 from cvo_edge.motion.records import MotionRecord, motion_header
@@ -45,6 +46,7 @@ def annotate_file(
 
     ``anchors``: a file with a time a line, in seconds.
     """
+    check_same(str(poses.path), poses.unscaled, calibration.pointed)
     known: list[int] = []
     if anchors is not None:
         known = [row.seconds() for row in read_rows(anchors, "time")]
@@ -69,7 +71,8 @@ def annotate_stream(
     comment before the first row names, and SinkError.
     """
     tracker = MotionTracker(calibration, *level, covariance)
-    records = (tracker.step(*each) for each in _lines(calibration.file.columns))
+    lines = _lines(calibration.file.columns, calibration.pointed)
+    records = (tracker.step(*each) for each in lines)
     _write(calibration, level, records, output, written_as, 1)
 
 
@@ -81,17 +84,20 @@ def format_of(path: str, format: MotionFormat | None) -> MotionFormat:
 
 
 def _lines(
-    needed: Sequence[str],
+    needed: Sequence[str], pointed: bool
 ) -> Iterator[tuple[int, NDArray[np.float64] | None, dict[str, float]]]:
     """Yield stamp, pose and columns of each line of standard input, as a file of it has them."""
     if sys.stdin is None:
         raise SourceError("standard input: expected lines of poses, found it closed")
-    names, started = FORM.split(), False
+    names, started, unscaled = FORM.split(), False, False
     for number, line in enumerate(sys.stdin.buffer, start=1):
         text = line.decode("utf-8", "replace").strip()
         if not text or text.startswith("#"):
             names = names if started else tum_names(text) or names
+            unscaled |= not started and says_unscaled(text)
             continue
+        if not started:
+            check_same("standard input", unscaled, pointed)
         columns = names[len(FORM.split()) :]
         if not started and (missing := [name for name in needed if name not in columns]):
             raise UsageError(

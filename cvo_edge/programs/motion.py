@@ -272,6 +272,8 @@ def annotate(
     written_as = format_of(output, format)
     if covariance is not None and written_as != "jsonl":
         raise UsageError(f"--covariance: expected the format jsonl, found {written_as}")
+    if calibration.pointed and written_as == "csv":
+        raise UsageError("--format: expected jsonl or tum for an estimator without a scale")
     if estimate == "-":
         if anchors is not None:
             raise UsageError("--anchors: expected a file of poses, found standard input")
@@ -343,6 +345,8 @@ def audit(
     level = calibration.level(confidence, rule, scope)
     if picture is not None and picture.suffix.lower() != ".png":
         raise UsageError(f"--picture: expected a file .png, found {picture}")
+    if picture is not None and calibration.pointed:
+        raise UsageError("--picture: expected a calibration in metres, found one without a scale")
     named = listed_files(given, pairs, [])
     read = [path for each in named for path in each.paths]
     for written in (json_file, picture):

@@ -28,7 +28,9 @@ def fit_lines(fits: Sequence[Fit], made: Sequence[str]) -> Iterator[str]:
 
     Of many pairs: their spread, and those that stand out.
     """
-    if len(fits) <= _MOST_LINES:
+    if not fits:
+        yield "alignment: not compared, as the drives are too short"
+    elif len(fits) <= _MOST_LINES:
         yield from _pair_lines(fits)
     else:
         yield from _spread_lines(fits)
@@ -114,7 +116,7 @@ def _axis(axis: np.ndarray) -> str:
 
 
 def _worth(fits: Sequence[Fit], correction: MotionCorrection, made: bool) -> Iterator[str]:
-    found = [fit for fit in fits if fit.effects[correction].worth]
+    found = [fit for fit in fits if correction in fit.effects and fit.effects[correction].worth]
     if not found:
         return
     before = np.median([fit.effects[correction].before for fit in found], axis=0)
@@ -154,14 +156,18 @@ def _what(found: Sequence[Fit], correction: MotionCorrection) -> str:
 def calibration_lines(file: MotionFile) -> Iterator[str]:
     """Yield what was calibrated: for each horizon half-widths at 0.9, and what each rule states."""
     calibration = MotionCalibration(file)
+    first = "direction in deg" if calibration.pointed else "cm"
     yield (
         f"{'horizon':>8}{'drives':>8}{'motions':>9}{'bias':>6}{'scale':>7}  "
-        "usual radius at 0.9: cm, deg by rule"
+        f"usual radius at 0.9: {first}, rotation in deg by rule"
     )
     for spec, horizon in zip(file.horizons, calibration.horizons, strict=True):
         parts = []
         for rule in MOTION_RULES:
             radii = horizon.thresholds(Level(rule=rule))[6:] * spec.usual[6:]
+            if calibration.pointed:
+                # Printed in cm.
+                radii[0] = 0.01 * math.degrees(radii[0])
             parts.append(f"{rule} {_radii(*radii)}")
         yield (
             f"{spec.horizon:>8}{spec.recordings:>8}{spec.motions:>9}"
@@ -201,6 +207,9 @@ def audit_lines(report: Audit) -> Iterator[str]:
     if rate:
         names = ", ".join(f"{printable(name)} {share:.2f}" for name, share in rate.items())
         yield f"share of poses at another rate, without horizons in frames and integrated: {names}"
+    if any(each.directions is not None for one in report.recordings for each in one.horizons):
+        yield from _pointed_lines(report)
+        return
     yield (
         f"{'horizon':>8}{'recordings':>12}{'each DoF':>10}{'all six':>9}{'position':>10}"
         f"{'rotation':>10}{'least':>7}  mean half-width, radius"
@@ -244,6 +253,30 @@ def audit_lines(report: Audit) -> Iterator[str]:
     for span_s in dict.fromkeys(each.seconds for r in report.recordings for each in r.integrated):
         sums = [x for r in report.recordings for x in r.integrated if x.seconds == span_s]
         yield _nees_line(f"{span_s:>7g}s  integrated", sums)
+
+
+def _pointed_lines(report: Audit) -> Iterator[str]:
+    """Yield coverage and width of an estimator without a scale."""
+    yield (
+        f"{'horizon':>8}{'recordings':>12}{'each DoF':>10}{'all three':>11}{'rotation':>10}"
+        f"{'direction':>11}{'with one':>10}  mean half-width, radius, direction: deg"
+    )
+    for name in report.horizons:
+        found = report.over(name)
+        if not found:
+            yield f"{name:>8}{0:>12}  no motion with a truth at both ends"
+            continue
+        some = [each for each in found if each.directions]
+        inside = f"{np.mean([each.position for each in some]):.3f}" if some else "-"
+        radius = f"{math.degrees(np.mean([each.radii[0] for each in some])):.3g}" if some else "-"
+        share = sum(each.directions or 0 for each in found) / sum(each.motions for each in found)
+        yield (
+            f"{name:>8}{len(found):>12}{np.mean([each.dof for each in found]):>10.3f}"
+            f"{np.mean([each.joint for each in found]):>11.3f}"
+            f"{np.mean([each.rotation for each in found]):>10.3f}{inside:>11}{share:>10.2f}  "
+            f"{math.degrees(np.mean([each.half_widths for each in found])):.3g}, "
+            f"{math.degrees(np.mean([each.radii[1] for each in found])):.3g}, {radius}"
+        )
 
 
 def _nees_line(what: str, found: Sequence[HorizonAudit] | Sequence[NeesAudit]) -> str:

@@ -13,7 +13,9 @@ import typer
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.files import refuse_overwriting
 from cvo_edge.process import say
+from cvo_edge.programs.motion import ConfidenceOption, RuleOption, ScopeOption
 from cvo_edge.programs.options import (
+    INTERVALS,
     REPORT,
     MaxFramesOption,
     OutputOption,
@@ -21,11 +23,13 @@ from cvo_edge.programs.options import (
     TimeoutOption,
     examples,
 )
+from cvo_edge.vocabulary import MotionRule, Scope
 
 if TYPE_CHECKING:
     from cvo_edge.camera import Camera
     from cvo_edge.frontend.odometry import Lengths
     from cvo_edge.frontend.steps import Step
+    from cvo_edge.motion.tracker import MotionTracker
 
 # Poses of --scale count within this time.
 _NEAR_NS = 20_000_000
@@ -76,6 +80,18 @@ def odometry(
             rich_help_panel="Input",
         ),
     ] = None,
+    motion: Annotated[
+        Path | None,
+        typer.Option(
+            help="motion.json of conformalize: adds intervals on rotation and direction.",
+            readable=False,
+            show_default=False,
+            rich_help_panel=INTERVALS,
+        ),
+    ] = None,
+    confidence: ConfidenceOption = 0.9,
+    rule: RuleOption = "mean",
+    scope: ScopeOption = "marginal",
     quiet: Annotated[
         bool, typer.Option("--quiet", help="No summary.", rich_help_panel=REPORT)
     ] = False,
@@ -92,7 +108,6 @@ def odometry(
 
     from cvo_edge.camera import checked_camera, read_camera
     from cvo_edge.frontend.odometry import FrontEnd
-    from cvo_edge.frontend.records import json_heading, json_line, tum_heading, tum_row
     from cvo_edge.input.capture import shown
     from cvo_edge.input.sources import open_source
     from cvo_edge.output.lines import LineFile
@@ -100,19 +115,20 @@ def odometry(
     # For so little work, threads cost more processor time than they save.
     cv2.setNumThreads(1)
     written_as = _format_of(output, format)
-    refuse_overwriting(output, source, camera, scale, stamps)
+    refuse_overwriting(output, source, camera, scale, stamps, motion)
     calibrated = checked_camera(read_camera(camera))
+    tracker = _tracker(motion, written_as, scale, confidence, rule, scope)
     lengths = None if scale is None else _lengths(scale, fps)
     frames = open_source(source, fps, timeout, stamps)
     front = FrontEnd(calibrated, lengths)
-    heading, line = (json_heading, json_line) if written_as == "jsonl" else (tum_heading, tum_row)
-    first = heading(calibrated, None if scale is None else scale.name)
+    stamped = written_as == "tum" or scale is not None or tracker is not None
+    first = _heading(calibrated, scale, written_as, tracker)
     seen: Counter[str] = Counter()
     with LineFile(output) as lines, closing(front.stream(frames)) as steps:
         try:
             for step in islice(steps, max_frames):
-                _check(step, source, calibrated, written_as, scale)
-                lines.write(first + line(step))
+                _check(step, source, calibrated, stamped=stamped)
+                lines.write(first + _line(step, written_as, tracker))
                 first = b""
                 seen.update([step.status, *step.reasons])
         finally:
@@ -151,14 +167,64 @@ def _lengths(path: Path, fps: float | None) -> Lengths:
     return length_m
 
 
-def _check(
-    step: Step, source: str, camera: Camera, written_as: StepFormat, scale: Path | None
-) -> None:
+def _tracker(
+    motion: Path | None,
+    written_as: StepFormat,
+    scale: Path | None,
+    confidence: float,
+    rule: MotionRule,
+    scope: Scope,
+) -> MotionTracker | None:
+    """Return what gives intervals; raises UsageError if they do not suit the output."""
+    if motion is None:
+        return None
+    if written_as != "jsonl":
+        raise UsageError(f"--motion: expected the format jsonl, found {written_as}")
+    from cvo_edge.frontend.records import COLUMNS
+    from cvo_edge.motion.direction import check_same
+    from cvo_edge.motion.tracker import MotionTracker
+
+    tracker = MotionTracker(motion, confidence, rule, scope)
+    check_same("odometry", scale is None, tracker.calibration.pointed)
+    for name in tracker.calibration.file.columns:
+        if name not in COLUMNS:
+            raise UsageError(f"{motion}: expected columns of {', '.join(COLUMNS)}, found {name}")
+    return tracker
+
+
+def _heading(
+    camera: Camera, scale: Path | None, written_as: StepFormat, tracker: MotionTracker | None
+) -> bytes:
+    from msgspec import UNSET
+
+    from cvo_edge.frontend.records import json_heading, tum_heading
+    from cvo_edge.motion.records import motion_header
+
+    name = None if scale is None else scale.name
+    if written_as == "tum":
+        return tum_heading(camera, name)
+    header = UNSET if tracker is None else motion_header(tracker.calibration, tracker.level)
+    return json_heading(camera, name, header)
+
+
+def _line(step: Step, written_as: StepFormat, tracker: MotionTracker | None) -> bytes:
+    from cvo_edge.frontend.records import columns_of, json_line, record_of, tum_row, with_intervals
+
+    if written_as == "tum":
+        return tum_row(step)
+    record = record_of(step)
+    if tracker is not None and step.stamp_ns is not None:
+        found = tracker.step(step.stamp_ns, step.pose, columns_of(step))
+        record = with_intervals(record, found)
+    return json_line(record)
+
+
+def _check(step: Step, source: str, camera: Camera, *, stamped: bool) -> None:
     """Raise UsageError for a source of which no frame can be used: its size, or without stamps."""
     from cvo_edge.frontend.steps import StepReason
     from cvo_edge.input.capture import shown
 
-    if step.stamp_ns is None and (written_as == "tum" or scale is not None):
+    if step.stamp_ns is None and stamped:
         raise UsageError(
             f"{shown(source)}: expected a stamp for every frame, {step.source or 'a frame'} has "
             "none; give --fps or --stamps"

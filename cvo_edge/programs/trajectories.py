@@ -222,15 +222,18 @@ def _alike(parts: Sequence[Sequence[str]]) -> int:
 
 
 def fits(pairs: Spread[Pair]) -> list[Fit]:
-    """Compare the trajectories of each pair.
+    """Compare the trajectories of each pair; those of steps without a scale if they can be.
 
     Raises SourceError for a pair with too few motions, and for one in other units.
     """
-    return pairs.map(_fit, what="alignment").collect()
+    found = pairs.map(_fit, what="alignment").collect()
+    return [fit for fit in found if fit is not None]
 
 
-def _fit(pair: Pair) -> Fit:
+def _fit(pair: Pair) -> Fit | None:
     alignment = pair.aligned()
+    if alignment is None and pair.unscaled:
+        return None
     if alignment is None:
         raise SourceError(
             f"{pair.name}: expected at least {LEAST_MOTIONS} motions of half a second, or from "
@@ -239,6 +242,9 @@ def _fit(pair: Pair) -> Fit:
         )
     _check_fit(pair, alignment)
     fit = fit_of(pair, alignment)
+    if pair.unscaled:
+        # Its scale is that of the steps, which nobody could correct.
+        return fit._replace(effects={each: fit.effects[each] for each in ("time", "frame")})
     if fit.unit is not None:
         raise SourceError(
             f"{pair.name}: expected metres in both files, found motions of the truth that are "
@@ -287,6 +293,15 @@ def correct_pairs(
 
     Raises UsageError for scales that differ by more than a tenth: no number corrects them.
     """
+    if not wanted:
+        return pairs, CorrectionSpec(offset_s=None, q_xyzw=None, scale=None)
+    if len(fits) < len(pairs):
+        raise UsageError(
+            "--correct: expected drives that are long enough to be compared, found "
+            f"{len(pairs) - len(fits)} of {len(pairs)} with fewer than {LEAST_MOTIONS} motions"
+        )
+    if "scale" in wanted and any("scale" not in fit.effects for fit in fits):
+        raise UsageError("--correct scale: expected estimates in metres, found steps without scale")
     alignments = [fit.alignment for fit in fits]
     scale = None
     if "scale" in wanted:
