@@ -29,7 +29,7 @@ _MOST_PER_TASK = 16
 
 
 class ClusterError(CvoError):
-    """A cluster lost a task more often than it is retried."""
+    """A cluster lost a task more often than it is retried, or has no room for what it gave."""
 
 
 class Spread(Protocol[T]):
@@ -146,10 +146,12 @@ class OnRay:
         try:
             return list(self._ray.get(self._references))
         except self._ray.exceptions.RayTaskError as error:
-            raise error.cause from None
+            if isinstance(error.cause, CvoError):
+                raise error.cause from None
+            raise
         except self._ray.exceptions.RayError as error:
             line = " ".join(str(error).split())[:200]
-            raise ClusterError(f"a task's worker was lost {_RETRIES + 1} times: {line}") from None
+            raise ClusterError(f"expected what a task of the cluster gave, found: {line}") from None
 
 
 def _on_a_worker(

@@ -3,6 +3,8 @@
 import io
 import pickle
 import shlex
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -71,7 +73,7 @@ def test_without_a_cluster_nothing_is_written(tmp_path: Path, monkeypatch) -> No
     output = tmp_path / "motion.json"
     code, text = run("conformalize", *files, "-o", output, "--engine", "ray")
     assert (code, "conformalize: no Ray cluster at 127.0.0.1:9" in text) == (2, True), text
-    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    monkeypatch.setitem(sys.modules, "ray", None)
     code, text = run("conformalize", *files, "-o", output, "--engine", "ray")
     assert (code, 'pip install "cvo-edge[ray]"' in text) == (2, True), text
     assert not output.exists()
@@ -125,3 +127,20 @@ def test_progress_counts_each_kind_of_work_by_itself() -> None:
     lines = terminal.getvalue().split("\r\x1b[K")
     assert lines[1] == "reading: 1 of 8 recordings  0:00 left"
     assert lines[-1] == "alignment: 4 of 8 recordings  0:01 left"
+
+
+def test_a_signal_that_ray_replaces_keeps_its_exit_code() -> None:
+    program = """
+import os, signal, typer
+from cvo_edge.process import guarded
+app = typer.Typer()
+@app.command()
+def wait(what: str):
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+    except SystemExit:
+        raise SystemExit(1) from None
+guarded("cvo-edge", app)
+"""
+    command = [sys.executable, "-c", program, "until killed"]
+    assert subprocess.run(command, check=False).returncode == 143
