@@ -16,13 +16,10 @@ from cvo_edge.errors import UsageError
 from cvo_edge.motion.relative import between, rotation_vector
 from cvo_edge.motion.trace import MEANS, RECENT_NS, Limits
 from cvo_edge.pose import Pose
-from cvo_edge.trajectories.poses import FARTHEST_M
+from cvo_edge.trajectories.poses import FARTHEST_M, unit_quaternion
 
 # Poses that are kept at most: a horizon of 100 m is long for a robot that stands.
 KEPT = 1 << 16
-# Squares of quaternions that are divided by their norm are one up to this. They are left as they
-# are: a pose that was read from a file stays the same.
-_UNIT = 1e-15
 _MISSING = (math.nan,) * 7
 _LAST_NS = 2**63 - 1
 
@@ -156,10 +153,7 @@ def seven(pose: Pose | ArrayLike | None) -> tuple[float, ...]:
     near = abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and abs(z) < FARTHEST_M
     if not (near and 0.0 < square < math.inf):
         return _MISSING
-    if abs(square - 1.0) > _UNIT:
-        norm = math.sqrt(square)
-        a, b, c, d = a / norm, b / norm, c / norm, d / norm
-    return (x, y, z, -a, -b, -c, -d) if d < 0.0 else (x, y, z, a, b, c, d)
+    return (x, y, z, *unit_quaternion(q))
 
 
 def nanoseconds(stamp_ns: int) -> int:

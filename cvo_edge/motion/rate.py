@@ -28,7 +28,7 @@ class Rate:
             del self._sorted[bisect_left(self._sorted, self._steps.popleft())]
         self._steps.append(step_ns)
         insort(self._sorted, step_ns)
-        return 1e-9 * self._sorted[len(self._sorted) // 2]
+        return 1e-9 * self._sorted[(len(self._sorted) - 1) // 2]
 
 
 def periods_s(stamps_ns: Integers) -> Array:

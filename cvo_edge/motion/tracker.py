@@ -357,13 +357,15 @@ class MotionTracker:
             return self._outside
         seconds = 1e-9 * (kept.stamps_ns[last] - kept.stamps_ns[row])
         metres = kept.path_m[last] - kept.path_m[row]
-        frames, extent = last - row, np.array([[seconds], [metres]])
-        numbers = since_numbers(np.array(kept.means(row, last))[:, np.newaxis], extent)
+        frames, numbers = last - row, None
         tubes = []
         for window in self.calibration.windows:
             tube = SinceAnchor(window.spec.window, self._anchor_seq, seconds, metres)
             since = window.since(frames, seconds, metres)
             if since <= window.window.value:
+                if numbers is None:
+                    means, extent = np.array([kept.means(row, last)]), [[seconds], [metres]]
+                    numbers = since_numbers(means.T, np.array(extent))
                 widths = window.after(np.array([float(since)]), numbers, self.level)[:, 0]
                 tube = with_tube(tube, widths if frames else np.zeros(8))
             tubes.append(tube)

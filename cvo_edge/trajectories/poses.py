@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,8 @@ _MAX_MATRIX_BYTES = 1 << 16
 # Files round quaternions and matrices to a few digits.
 _TOLERANCE = 0.01
 _LAST_ROW = 1e-6
+# Squares of quaternions that are divided by their norm are one up to this.
+_UNIT = 1e-15
 # Further away than the moon: no coordinates of a place. Networks' outputs have the same limit.
 FARTHEST_M = 1e9
 
@@ -33,7 +37,7 @@ def quaternion_pose(position_m: Array, q_xyzw: Array) -> Array | None:
     """
     if quaternion_fault(position_m, q_xyzw) is not None:
         return None
-    return np.concatenate([position_m, geometry.quaternion_normalise(q_xyzw)])
+    return np.concatenate([position_m, _unit(q_xyzw)])
 
 
 def quaternion_poses(positions_m: Array, q_xyzw: Array) -> tuple[list[Array | None], list[str]]:
@@ -41,13 +45,34 @@ def quaternion_poses(positions_m: Array, q_xyzw: Array) -> tuple[list[Array | No
     with np.errstate(all="ignore"):
         norms = np.linalg.norm(q_xyzw, axis=1)
         valid = (np.abs(norms - 1.0) <= _TOLERANCE) & (np.abs(positions_m) < FARTHEST_M).all(axis=1)
-        every = np.concatenate([positions_m, geometry.quaternion_normalise(q_xyzw)], axis=1)
+        every = np.concatenate([positions_m, _unit(q_xyzw)], axis=1)
     poses = [pose if fine else None for pose, fine in zip(every, valid.tolist(), strict=True)]
     faults = [
         "" if fine else quaternion_fault(position_m, q) or ""
         for position_m, q, fine in zip(positions_m, q_xyzw, valid.tolist(), strict=True)
     ]
     return poses, faults
+
+
+def _unit(q_xyzw: Array) -> Array:
+    """Return quaternions (..., 4) as ``unit_quaternion``, to the last bit."""
+    x, y, z, w = np.moveaxis(q_xyzw, -1, 0)
+    square = x * x + y * y + z * z + w * w
+    norm = np.where(np.abs(square - 1.0) <= _UNIT, 1.0, np.sqrt(square))
+    return np.asarray(q_xyzw / (norm * np.where(w < 0.0, -1.0, 1.0))[..., np.newaxis])
+
+
+def unit_quaternion(q_xyzw: Sequence[float]) -> tuple[float, float, float, float]:
+    """Return a quaternion other than zero with a norm of one, qw >= 0.
+
+    One whose norm is as near to one as rounding allows stays as it is, so that poses that were
+    read before stay the same.
+    """
+    x, y, z, w = q_xyzw
+    square = x * x + y * y + z * z + w * w
+    norm = 1.0 if abs(square - 1.0) <= _UNIT else math.sqrt(square)
+    norm = -norm if w < 0.0 else norm
+    return x / norm, y / norm, z / norm, w / norm
 
 
 def quaternion_fault(position_m: Array, q_xyzw: Array) -> str | None:

@@ -482,6 +482,12 @@ def test_every_format_has_every_pose(tmp_path: Path, file: MotionFile) -> None:
     done = CliRunner().invoke(app, words, input=estimate.read_text())
     assert done.exit_code == 0, done.output
     assert piped.read_bytes() == whole.read_bytes()
+    # And in Python, with quaternions of any norm near one.
+    tracker = MotionTracker(MotionCalibration(file), covariance="integrated")
+    numbers = np.loadtxt(estimate)
+    stamps = read_poses(estimate).stamped().stamps_ns.tolist()
+    records = [tracker.step(*each) for each in zip(stamps, numbers[:, 1:], strict=True)]
+    assert [msgspec.json.encode(each) for each in records] == whole.read_bytes().splitlines()[1:]
     last = whole.read_bytes().splitlines()[-1]
     assert msgspec.json.decode(last, type=MotionRecord).covariance
 
