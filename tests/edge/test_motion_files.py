@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from cvo_edge.errors import CalibrationFileError, SourceError, UsageError
 from cvo_edge.estimate import Status
+from cvo_edge.motion.adaptation import MotionAdaptation
 from cvo_edge.motion.annotation import annotate
 from cvo_edge.motion.audit import audit
 from cvo_edge.motion.conformalize import conformalize
@@ -217,15 +218,28 @@ def test_lone_labels_move_nothing(plain: MotionCalibration) -> None:
             assert (update.covered[1] is None) == (place < 16)
 
 
-def test_truths_without_errors_leave_a_twentieth(plain: MotionCalibration) -> None:
+def test_truths_without_errors_leave_a_twentieth() -> None:
     """As of a robot that stands; the next error is not missed for long."""
-    pair = drive(90, 600)
-    tracker = MotionTracker(plain, adapt=True)
-    for stamp, pose in zip(pair.stamps_ns.tolist(), pair.estimate, strict=True):
-        record = tracker.step(stamp, pose)
-        update = tracker.observe(stamp, pose)
-    assert update.factor[0] == pytest.approx([1 / 20] * 8)
-    assert record.motion[0].factor == pytest.approx([1 / 20] * 8)
+    adaptation = MotionAdaptation(0.1, joint=False)
+    for row in range(1100):
+        adaptation.update(row, row, 1, np.zeros(8))
+    assert np.exp(adaptation.x) == pytest.approx([1 / 20] * 8)
+
+
+@pytest.mark.parametrize("delay", [0, 10])
+def test_a_burst_of_errors_widens_little_and_a_lasting_change_is_followed(delay: int) -> None:
+    generator = np.random.default_rng(7)
+    scores = np.abs(generator.normal(size=(4000, 8))) / 1.645
+    scores[500:600] *= 1000.0
+    scores[1000:] *= 6.0
+    adaptation = MotionAdaptation(0.1, joint=False)
+    factors = []
+    for row in range(len(scores)):
+        factors.append(np.exp(adaptation.x))
+        if row >= delay:
+            adaptation.update(row - delay, row, 1, scores[row - delay])
+    assert np.max(factors[:700]) < 2.5 * 1.6
+    assert abs(np.mean(scores[-1000:] <= factors[-1000:]) - 0.9) < 0.03
 
 
 def test_labels_need_a_tracker_that_adapts(calibration: MotionCalibration) -> None:
