@@ -11,6 +11,7 @@ from cvo_edge.conformal import capped_quantile
 from cvo_edge.errors import UsageError
 from cvo_edge.motion.errors import errors_of
 from cvo_edge.motion.fitting import Normal, bias_sums, predict_bias, solve_bias
+from cvo_edge.motion.horizon_fit import stretched
 from cvo_edge.motion.horizons import Horizon, starts
 from cvo_edge.motion.kept import Kept
 from cvo_edge.motion.recordings import about, limits_of, trace_of
@@ -251,3 +252,20 @@ def test_a_tube_is_wider_where_errors_are_larger(depends: bool) -> None:
     # The six degrees of freedom, each in its unit, are all inside as often as stated.
     q = Scores(tube.scores, "abcdef").thresholds("mean", 0.9)
     assert abs(np.mean(np.concatenate(tube.scores) <= q) - 0.9) < 0.01
+
+
+def test_a_flat_scale_is_stretched_and_a_fitting_one_is_not() -> None:
+    generator = np.random.default_rng(8)
+    samples = []
+    for _ in range(8):
+        spread = np.exp(0.3 * generator.normal(size=(800, 8)))
+        # The first scale is flatter than the errors, the second fits, the others know nothing.
+        scales = np.ones((800, 8))
+        scales[:, 0], scales[:, 1] = spread[:, 0] ** 0.7, spread[:, 1]
+        errors = np.abs(generator.normal(size=(800, 8))) * spread
+        samples.append((errors / scales, scales))
+    stretch = stretched(samples, "abcdefgh")
+    assert 1.2 <= stretch.factor[0] <= 1.5
+    assert stretch.factor[1] <= 1.1
+    assert (stretch.factor[2:] == 1.0).all()
+    assert stretch.of(samples[0][1])[:, 2:] == pytest.approx(1.0)
