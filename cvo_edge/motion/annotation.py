@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import repeat
 
 import numpy as np
@@ -111,32 +113,38 @@ def _records(
     outside = tuple(SinceAnchor(each.spec.window) for each in calibration.windows)
     for begin in range(0, len(rows.part), _AT_ONCE):
         ends = np.arange(begin, min(begin + _AT_ONCE, len(rows.part)))
-        novelty = running.all(calibration.familiar.novelty(rows, ends), rows.part[ends])
-        shares = [None if value is None else value / limit for value in novelty]
-        by_horizon = [
-            _motions(rows, ends, differs[ends], each, level, none, of_motions)
-            for each, none in zip(calibration.horizons, nothing, strict=True)
-        ]
-        if calibration.pointed:
-            by_horizon = [list(map(pointed, each)) for each in by_horizon]
-        by_window = [
-            _tube(rows, each, anchors[ends], ends, level, none)
-            for each, none in zip(calibration.windows, outside, strict=True)
-        ]
-        motions = list(zip(*by_horizon, strict=True))
-        tubes = list(zip(*by_window, strict=True)) or [()] * len(ends)
-        covariances: list[tuple[float, ...] | UnsetType | None] = [UNSET] * len(ends)
-        if steps is not None:
-            covariances = _steps(calibration, steps, rows, ends, differs[ends])
-        for place, share in enumerate(shares):
-            if share is not None and share > 1.0:
-                motions[place], tubes[place] = nothing, outside
-                reasons[begin + place] = (MotionReason.MOTION_UNFAMILIAR, *reasons[begin + place])
-                if steps is not None:
-                    covariances[place] = None
-        x, y, z, *q = rows.poses[ends].T.tolist()
-        given = map(RecordedPose, zip(x, y, z, strict=True), zip(*q, strict=True))
-        poses = [None if math.isnan(first) else pose for first, pose in zip(x, given, strict=True)]
+        with _uncollected():
+            novelty = running.all(calibration.familiar.novelty(rows, ends), rows.part[ends])
+            shares = [None if value is None else value / limit for value in novelty]
+            by_horizon = [
+                _motions(rows, ends, differs[ends], each, level, none, of_motions)
+                for each, none in zip(calibration.horizons, nothing, strict=True)
+            ]
+            if calibration.pointed:
+                by_horizon = [list(map(pointed, each)) for each in by_horizon]
+            by_window = [
+                _tube(rows, each, anchors[ends], ends, level, none)
+                for each, none in zip(calibration.windows, outside, strict=True)
+            ]
+            motions = list(zip(*by_horizon, strict=True))
+            tubes = list(zip(*by_window, strict=True)) or [()] * len(ends)
+            covariances: list[tuple[float, ...] | UnsetType | None] = [UNSET] * len(ends)
+            if steps is not None:
+                covariances = _steps(calibration, steps, rows, ends, differs[ends])
+            for place, share in enumerate(shares):
+                if share is not None and share > 1.0:
+                    motions[place], tubes[place] = nothing, outside
+                    reasons[begin + place] = (
+                        MotionReason.MOTION_UNFAMILIAR,
+                        *reasons[begin + place],
+                    )
+                    if steps is not None:
+                        covariances[place] = None
+            x, y, z, *q = rows.poses[ends].T.tolist()
+            given = map(RecordedPose, zip(x, y, z, strict=True), zip(*q, strict=True))
+            poses = [
+                None if math.isnan(first) else pose for first, pose in zip(x, given, strict=True)
+            ]
         yield from map(
             MotionRecord,
             ends.tolist(),
@@ -152,6 +160,18 @@ def _records(
 
 
 _UNSET: Iterable[UnsetType] = repeat(UNSET)
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Look for no cycles while records are made, which have none: a tenth of the time."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
 
 
 def _reasons(
