@@ -6,6 +6,10 @@ has: the rotation nearest to that of a fit without translation is right. Both si
 fit equally well; points in front of both cameras decide, each one by how far it moved, so that
 points without parallax decide nothing. Where most points have hardly any parallax, the fit without
 translation is the better one, and says nothing of a direction.
+
+Points of one plane fit two motions equally well (Longuet-Higgins 1986), both from their homography
+(Malis and Vargas 2007). A camera turns smoothly: the one whose rotation is nearer to that of the
+step before is taken, unless the other one fits better.
 """
 
 from __future__ import annotations
@@ -29,6 +33,11 @@ LEAST_INLIERS, _LEAST_SHARE = 15, 0.3
 # a pixel, a motion with little parallax agrees with any direction.
 _AGREES_PX, _SOUGHT_PX = 1.0, 0.25
 _MOST_SAMPLES, _SURE = 100, 0.999
+# Share of the points near a homography's with which the other motion of a plane is looked for, and
+# how much lower the other one's loss has to be.
+_PLANE, _BETTER = 0.8, 0.9
+# A loss that is not worth comparing: errors of a thirtieth of their scale.
+_NO_LOSS = 1e-3
 # Cauchy's scale is at least this, in pixels: what follows points is not more exact.
 _LEAST_SCALE_PX = 0.3
 # Pixels of parallax beyond which a point counts no more for the sign of the direction.
@@ -36,6 +45,7 @@ _SURELY_PX = 2.0
 # Cauchy's scale in deviations of normal errors.
 _DEVIATIONS = 2.385
 _RARELY = math.pi
+_STILL = np.eye(3)
 
 
 class Motion(NamedTuple):
@@ -64,10 +74,11 @@ class Motion(NamedTuple):
     deviations: tuple[float, float]
 
 
-def solve(x1: Array, x2: Array, focal_px: float) -> Motion | None:
+def solve(x1: Array, x2: Array, focal_px: float, before: Array = _STILL) -> Motion | None:
     """Rays (3, n) of the earlier and the later image -> the motion; None if too few points agree.
 
-    The third component of a ray is 1; ``focal_px`` pixels are a unit.
+    The third component of a ray is 1; ``focal_px`` pixels are a unit. ``before`` (3, 3): the
+    rotation of the step before.
     """
     if x1.shape[1] < LEAST_INLIERS:
         return None
@@ -80,6 +91,12 @@ def solve(x1: Array, x2: Array, focal_px: float) -> Motion | None:
     if start is None:
         return None
     moved = refine_motion(x1, x2, *start, least)
+    for start in _of_plane(x1, x2, moved, focal_px):
+        other = refine_motion(x1, x2, *start, least)
+        scale = min(moved.scale, other.scale)
+        nearer = np.sum(other.R * before) > np.sum(moved.R * before)
+        if _loss(other, scale) * (_BETTER if nearer else 1.0 / _BETTER) < _loss(moved, scale):
+            moved = other
     sign = _sign(x1, x2, moved, focal_px)
     return _motion(moved, sign * moved.t, parallax_px, focal_px)
 
@@ -124,6 +141,34 @@ def _five_points(x1: Array, x2: Array, R: Array, focal_px: float) -> tuple[Array
     first, second, t = cv2.decomposeEssentialMat(E[:3])
     nearest = max((first, second), key=lambda each: float(np.sum(each * R)))
     return np.asarray(nearest, np.float64), np.asarray(t, np.float64).ravel()
+
+
+def _of_plane(x1: Array, x2: Array, found: Refined, focal_px: float) -> list[tuple[Array, Array]]:
+    """Return the motions (R, t) of the points' homography; none unless they are of one plane."""
+    agree = np.abs(found.errors) * focal_px < _AGREES_PX
+    if agree.sum() < LEAST_INLIERS:
+        return []
+    H, _ = cv2.findHomography(x2[:2, agree].T, x1[:2, agree].T, 0)
+    if H is None:
+        return []
+    y = H @ x2[:, agree]
+    with np.errstate(all="ignore"):
+        off_px = focal_px * np.linalg.norm(y[:2] / y[2] - x1[:2, agree], axis=0)
+    if not (off_px < _AGREES_PX).mean() > _PLANE:
+        return []
+    _, R, t, normals = cv2.decomposeHomographyMat(H, _STILL)
+    motions = []
+    for each, direction, normal in zip(R, t, normals, strict=True):
+        length = float(np.linalg.norm(direction))
+        # A plane that the camera sees is in front of it.
+        if length > 0.0 and (normal.T @ x2 > 0.0).mean() > _PLANE:
+            unit = np.asarray(direction, np.float64).ravel() / length
+            motions.append((np.asarray(each, np.float64), unit))
+    return motions
+
+
+def _loss(found: Refined, scale: float) -> float:
+    return _NO_LOSS + float(np.log1p(np.square(found.errors / scale)).mean())
 
 
 def _sign(x1: Array, x2: Array, found: Refined, focal_px: float) -> float:

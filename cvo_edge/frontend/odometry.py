@@ -47,6 +47,7 @@ class FrontEnd:
         self._before: Grey | None = None
         self._stamp_ns: int | None = None
         self._seq = 0
+        self._turn = np.eye(3)
         self._t = np.zeros(3)
         self._q = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -82,7 +83,7 @@ class FrontEnd:
         count = int(known.sum())
         if count < LEAST_INLIERS:
             return self._lost(frame, seq, StepReason.TRACKS_FEW, count)
-        motion = solve(x1[:, known], x2[:, known], self._lens.focal_px)
+        motion = solve(x1[:, known], x2[:, known], self._lens.focal_px, self._turn)
         if motion is None:
             return self._lost(frame, seq, StepReason.NO_CONSENSUS, count)
         length_m = None
@@ -95,6 +96,7 @@ class FrontEnd:
         return self._step(frame, seq, reasons, count, motion, length_m)
 
     def _lost(self, frame: Frame, seq: int, reason: StepReason, tracks: int = 0) -> Step:
+        self._turn = np.eye(3)
         nowhere = np.full(7, np.nan)
         return Step(seq, frame.stamp_ns, frame.source, (reason,), tracks, None, None, nowhere)
 
@@ -107,6 +109,7 @@ class FrontEnd:
         motion: Motion | None,
         length_m: float | None,
     ) -> Step:
+        self._turn = np.eye(3) if motion is None else motion.R
         if motion is not None:
             if motion.direction is not None:
                 length = 1.0 if length_m is None else length_m

@@ -23,6 +23,8 @@ _TOP, _MOST_LEVELS = 30, 6
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02)
 # A point that is followed back has to come this near to where it was, pixels.
 _BACK = 1.0
+# Logarithm of a gain, and grey levels, that make no difference.
+_SAME_GAIN, _SAME_MEAN = 0.02, 2.0
 
 
 class Tracks(NamedTuple):
@@ -41,6 +43,24 @@ def corners(image: Grey) -> Points:
     return np.asarray([] if found is None else found, np.float32).reshape(-1, 2)
 
 
+def as_bright(image: Grey, other: Grey) -> Grey:
+    """Return an image with the mean and the spread of grey levels of another one.
+
+    Lucas-Kanade takes a point's brightness for constant, and cameras change their exposure.
+    """
+    (mean, spread), (wanted, wanted_spread) = map(_levels, (image, other))
+    gain = wanted_spread / max(spread, 1.0)
+    if abs(math.log(max(gain, 1e-3))) < _SAME_GAIN and abs(mean - wanted) < _SAME_MEAN:
+        return image
+    levels = np.rint((np.arange(256) - mean) * gain + wanted)
+    return np.asarray(cv2.LUT(image, np.clip(levels, 0, 255).astype(np.uint8)), np.uint8)
+
+
+def _levels(image: Grey) -> tuple[float, float]:
+    mean, spread = cv2.meanStdDev(image)
+    return float(mean[0, 0]), float(spread[0, 0])
+
+
 def follow(before: Grey, after: Grey, points: Points) -> Tracks:
     """Follow points (n, 2) from an image to the next one by pyramidal Lucas-Kanade, and back.
 
@@ -48,6 +68,7 @@ def follow(before: Grey, after: Grey, points: Points) -> Tracks:
     """
     if not len(points):
         return Tracks(points, points)
+    after = as_bright(after, before)
     shortest = min(before.shape)
     levels = max(0, min(_MOST_LEVELS, math.floor(math.log2(shortest / _TOP))))
     window = (_WINDOW, _WINDOW)

@@ -59,6 +59,16 @@ def test_exact_points_give_the_exact_motion(t: tuple[float, ...]) -> None:
     assert found.inliers == 200
 
 
+@pytest.mark.parametrize("t", [(0.3, 0.0, 0.0), (0.0, -0.2, 0.1), (0.0, 0.0, 0.5)])
+def test_of_the_two_motions_of_a_plane_the_smoother_one_is_found(t: tuple[float, ...]) -> None:
+    x1, x2 = rays(TURN, np.array(t), plane=True)
+    found = solve(x1, x2, FOCAL, TURN @ rotation(np.array([0.0, 0.005, 0.0])))
+    assert found is not None
+    assert found.direction is not None
+    assert off(found.R, TURN) < 1e-4
+    assert found.direction @ t > 0.9999 * np.linalg.norm(t)
+
+
 def test_points_that_do_not_belong_to_each_other_are_left_out() -> None:
     x1, x2 = rays(TURN, np.array([0.3, 0.1, 0.2]), noise_px=0.2)
     x1[:2, :60] = np.random.default_rng(1).uniform(-0.5, 0.5, (2, 60))
@@ -184,6 +194,18 @@ def test_grey_colour_and_16_bits_give_the_same_step() -> None:
         found.append(front.step(form(second)).pose)
     assert np.array_equal(found[0], found[1])
     assert np.array_equal(found[0], found[2])
+
+
+def test_another_exposure_changes_no_rotation() -> None:
+    first, second = texture() // 2 + 40, np.roll(texture() // 2 + 40, 3, axis=1)
+    turns = []
+    for gain in (1.0, 0.7):
+        front = FrontEnd(camera())
+        front.step(first)
+        step = front.step(cv2.convertScaleAbs(second, alpha=gain))
+        assert step.motion is not None
+        turns.append(step.motion.R)
+    assert off(*turns) < 2e-4
 
 
 def run(*words: object) -> tuple[int, str]:
