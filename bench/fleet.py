@@ -1,11 +1,11 @@
 """``conformalize`` on many recordings: in one process, and on Ray with a worker killed on the way.
 
-    python bench/fleet.py FOLDER [--recordings 1000]
+    python bench/fleet.py FOLDER [--recordings 1000] [--poses 2300]
 
 Recordings are made of steps of the KITTI LiDAR odometry in ``CVO_DATA/trajectories``: blocks of 50
 to 250 steps of truth and error, drawn with a seed, half of them mirrored, the errors of each
-recording times a factor of its own; 2,300 poses each. FOLDER gets the files (0.4 GB a thousand),
-unless it has them already.
+recording times a factor of its own; at most 2,300 poses each. FOLDER gets the files (0.4 GB a
+thousand) and what each of the two runs took, unless it has them already.
 
 The cluster is a head with two cores on this machine. Once 30 % of the alignments are done, the
 worker that a task reports is killed in the middle of another one. Both files have to be equal.
@@ -25,7 +25,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -84,7 +84,7 @@ def drawn(
     return np.concatenate(steps)[cut], factor * np.concatenate(errors)[cut]
 
 
-def write(folder: Path, count: int) -> None:
+def write(folder: Path, count: int, length: int) -> None:
     """Write recordings, then the list of their files."""
     nothing = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     sources = []
@@ -107,7 +107,7 @@ def write(folder: Path, count: int) -> None:
                 poses[step + 1] = composed(poses[step], composed(true[:, step], back[:, step]))
         for index, name in enumerate(names):
             table = np.column_stack([stamps, poses[:, index]])
-            np.savetxt(folder / name[place], table, fmt="%.9f")
+            np.savetxt(folder / name[place], table[:length], fmt="%.9f")
     (folder / "pairs.txt").write_text("".join(f"{' '.join(name)}\n" for name in names))
 
 
@@ -186,10 +186,14 @@ def head() -> Iterator[tuple[str, int]]:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     os.environ["RAY_AUTH_MODE"] = "disabled"
+    # By default, anything else on the machine goes before workers.
+    plain = {"RAY_AUTH_MODE": "disabled", "RAY_worker_niceness": "0"}
     words = [f"--port={address.split(':')[1]}", "--node-ip-address=127.0.0.1", "--num-cpus=2"]
     words += ["--include-dashboard=false", "--disable-usage-stats"]
     command = [RAY, "start", "--head", "--block", *words, f"--object-store-memory={4 << 30}"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | plain
+    ) as process:
         try:
             check = [RAY, "health-check", "--address", address]
             while subprocess.run(check, check=False, capture_output=True).returncode:
@@ -227,11 +231,19 @@ def run_on_ray(listed: Path, output: Path) -> dict[str, Any]:
     return report | {"processor_s": report["driver_processor_s"] + sum(seconds.values())}
 
 
+def once(path: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what was measured before, or measure it now: a thousand recordings take a while."""
+    if not path.exists():
+        path.write_text(json.dumps(measure()))
+    return dict(json.loads(path.read_text()))
+
+
 def main() -> None:
     """Write recordings, calibrate twice, compare."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--recordings", type=int, default=1000)
+    parser.add_argument("--poses", type=int, default=POSES, help="of each, at most %(default)s")
     parser.add_argument("--driver", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--address", help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -242,14 +254,17 @@ def main() -> None:
     given.folder.mkdir(parents=True, exist_ok=True)
     known = listed.read_text().splitlines() if listed.exists() else []
     if len(known) != given.recordings:
-        write(given.folder, given.recordings)
+        write(given.folder, given.recordings, given.poses)
     local, ray = given.folder / "local.json", given.folder / "ray.json"
-    runs = [run(listed, local), run_on_ray(listed, ray)]
+    runs = [
+        once(given.folder / "local.run", partial(run, listed, local)),
+        once(given.folder / "ray.run", partial(run_on_ray, listed, ray)),
+    ]
     assert local.read_bytes() == ray.read_bytes(), "the files differ"
     assert [each["killed"] for each in runs] == [0, 1]
     report = {
         "recordings": given.recordings,
-        "poses": given.recordings * POSES,
+        "poses": given.recordings * given.poses,
         "bytes": local.stat().st_size,
         "equal": True,
         "runs": runs,

@@ -153,18 +153,18 @@ def costs() -> str:
 
 
 def fleet() -> str:
-    """One row for each engine: time and memory of many recordings."""
+    """One row for each engine: processor time and memory of many recordings."""
     found = read_result(FOLDER, FLEET)
     size = f"{found['recordings']:,} recordings, {found['poses']:,} poses"
+    engines = {"local": "one process", "ray": "Ray, two workers, one of them killed"}
     return table(
-        [size, "seconds", "of these alignment", "processor time, s", "peak memory here, MB"],
+        [size, "processor time, s", "of the process that merges, s", "its peak memory, MB"],
         [
             [
-                each["engine"],
-                f"{each['seconds']:.0f}",
-                f"{each['stages']['alignment']:.0f}",
+                engines[each["engine"]],
                 f"{each['processor_s']:.0f}",
-                f"{each['peak_mb']:.0f}",
+                f"{each['driver_processor_s']:.0f}",
+                f"{each['peak_mb']:,.0f}",
             ]
             for each in found["runs"]
         ],
