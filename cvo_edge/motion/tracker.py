@@ -182,29 +182,34 @@ class MotionTracker:
         if len(self._truths) > KEPT:
             del self._truths[next(iter(self._truths))]
         found = self._endings.at(self._kept, end)
+        scores, newest = self._scores(found, truth), self._kept.numbers[-1]
         covered: list[tuple[bool, ...] | None] = []
         for place, adaptation in enumerate(self._adaptations):
-            scores = self._scores(found, place, truth)
             inside = None
-            if scores is not None:
+            if place in scores:
                 span = end - found.start[place]
-                inside = adaptation.update(seq, self._kept.numbers[-1], span, scores)
+                inside = adaptation.update(seq, newest, span, scores[place])
             covered.append(None if inside is None else tuple(inside.tolist()))
         self._factors = np.exp([each.x for each in self._adaptations]).T
         return MotionUpdate(tuple(covered), tuple(map(tuple, self._factors.T.tolist())))
 
-    def _scores(self, found: Ending, place: int, truth: Array) -> Array | None:
-        """Return the scores (8,) of the motion over one horizon, over calibrated thresholds.
+    def _scores(self, found: Ending, truth: Array) -> dict[int, Array]:
+        """Return the scores (8,) of motions by horizon, over calibrated thresholds.
 
-        None if there is no motion, or no truth where it starts.
+        Horizons without a motion, or without a truth where it starts, are left out.
         """
-        if (start := found.start[place]) < 0:
-            return None
-        first = self._truths.get(self._kept.numbers[start])
-        if first is None:
-            return None
-        off = residual(np.array(found.moved[place]), motion(first, truth)) - found.bias[:, place]
-        return np.asarray(eight(off[np.newaxis])[0] / found.widths[:, place])
+        numbers = self._kept.numbers
+        firsts = {
+            place: self._truths[numbers[start]]
+            for place, start in enumerate(found.start)
+            if start >= 0 and numbers[start] in self._truths
+        }
+        if not firsts:
+            return {}
+        places = list(firsts)
+        moved = np.array(found.moved)[places]
+        off = residual(moved, motion(list(firsts.values()), truth)) - found.bias.T[places]
+        return dict(zip(places, eight(off) / found.widths.T[places], strict=True))
 
     def step(
         self,
