@@ -54,15 +54,15 @@ def three(dof: float, pair: list[float]) -> str:
 def tubes() -> str:
     """One row for each set and window."""
     return table(
-        ["set", "window", "recordings", "whole windows inside: position, rotation",
-         "width over bands of single times: position, rotation"],
+        ["set", "window", "recordings", "whole windows inside: position, rotation, all six",
+         "width over bands of single times: position, rotation, each DoF"],
         [
             [
                 found["set"],
                 each["window"],
                 str(each["recordings"]),
-                f"{each['inside'][0]:.3f}, {each['inside'][1]:.3f}",
-                f"{each['over_bands'][0]:.2f}, {each['over_bands'][1]:.2f}",
+                ", ".join(f"{share:.3f}" for share in each["inside"]),
+                ", ".join(f"{ratio:.2f}" for ratio in each["over_bands"]),
             ]
             for found in results()
             for each in found["tubes"]

@@ -55,7 +55,14 @@ from cvo_edge.motion.recordings import (
     recording_of,
     size_of,
 )
-from cvo_edge.motion.rounding import EXACT, numbers_of, rounded, scale_of, thresholds_of
+from cvo_edge.motion.rounding import (
+    EXACT,
+    coefficients_of,
+    numbers_of,
+    rounded,
+    scale_of,
+    thresholds_of,
+)
 from cvo_edge.motion.thresholds import Scores
 from cvo_edge.motion.tube_fit import fit_tube
 from cvo_edge.motion.windows import ANCHORS, Window, anchors_of, window_errors
@@ -247,7 +254,7 @@ def _horizon(
         horizon=str(horizon),
         recordings=len(set(own)),
         motions=sum(counts[index] for index in used),
-        bias=None if bias is None else tuple(map(numbers_of, bias)),
+        bias=None if bias is None else coefficients_of(bias),
         scale=None if scale is None else scale_of(scale),
         joint=numbers_of(unit),
         # Rounded, a nearly singular matrix might no longer be positive definite.

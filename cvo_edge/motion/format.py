@@ -194,7 +194,7 @@ def decode_motion_file(content: bytes, where: str = "motion.json") -> MotionFile
 
 def encode_motion_file(file: MotionFile) -> bytes:
     """Return the file's bytes, with the digest filled in; raises CalibrationFileError."""
-    content = encode_document(file, MAX_BYTES, "motion.json")
+    content = encode_document(file, MAX_BYTES, "motion.json", dense=True)
     decode_motion_file(content)
     return content
 

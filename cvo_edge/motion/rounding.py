@@ -10,17 +10,23 @@ from cvo_edge.motion.format import ScaleSpec
 
 Array = NDArray[np.float64]
 
-# Significant digits of coefficients and thresholds: nine horizons have to fit into 64 KiB.
-_COARSE, _FINE, EXACT = 4, 5, 9
+# Significant digits of coefficients, other numbers, thresholds and matrices: twelve horizons have
+# to fit into 64 KiB.
+_COEFFICIENT, _COARSE, _FINE, EXACT = 3, 4, 4, 9
 
 
 def scale_of(scale: Scale) -> ScaleSpec:
     """Return coefficients and ranges as the file keeps them."""
     return ScaleSpec(
-        coefficients=tuple(map(numbers_of, scale.coefficients)),
+        coefficients=coefficients_of(scale.coefficients),
         lowest=numbers_of(scale.lowest),
         highest=numbers_of(scale.highest),
     )
+
+
+def coefficients_of(values: Array) -> tuple[tuple[float, ...], ...]:
+    """Return the coefficients (k, d) of a bias or a scale, which need not be exact."""
+    return tuple(tuple(rounded(each, _COEFFICIENT) for each in row) for row in values.tolist())
 
 
 def thresholds_of(values: Array) -> tuple[float | None, ...]:

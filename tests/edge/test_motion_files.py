@@ -19,11 +19,19 @@ from cvo_edge.motion.annotation import annotate
 from cvo_edge.motion.audit import audit
 from cvo_edge.motion.conformalize import conformalize
 from cvo_edge.motion.files import OPENVINS_FORM, read_poses
-from cvo_edge.motion.format import MotionFile, decode_motion_file, encode_motion_file
+from cvo_edge.motion.fitting import Scale
+from cvo_edge.motion.format import (
+    BIAS_WIDTH,
+    MotionFile,
+    decode_motion_file,
+    encode_motion_file,
+)
 from cvo_edge.motion.horizons import Horizon
 from cvo_edge.motion.intervals import MotionCalibration
 from cvo_edge.motion.pairs import Pair
 from cvo_edge.motion.records import MotionHeader, MotionReason, MotionRecord
+from cvo_edge.motion.rounding import coefficients_of, scale_of
+from cvo_edge.motion.trace import scale_width
 from cvo_edge.motion.tracker import MotionTracker
 from cvo_edge.programs.cli import app
 from cvo_edge.spread import Here
@@ -67,6 +75,21 @@ def test_a_file_comes_back(file: MotionFile) -> None:
     again = decode_motion_file(content)
     assert msgspec.structs.replace(again, digest=file.digest) == file
     assert encode_motion_file(again) == content
+
+
+def test_twelve_horizons_fit_into_a_file(file: MotionFile) -> None:
+    generator = np.random.default_rng(0)
+    width = scale_width(0)
+    ranges = np.ones(width) / 3.0
+    full = msgspec.structs.replace(
+        file.horizons[0],
+        bias=coefficients_of(generator.normal(scale=1e-3, size=(BIAS_WIDTH, 6))),
+        scale=scale_of(Scale(generator.normal(size=(1 + width, 8)), -ranges, ranges)),
+    )
+    horizons = tuple(msgspec.structs.replace(full, horizon=f"{n}s") for n in range(10, 22))
+    windows = tuple(msgspec.structs.replace(file.windows[0], window=f"{n}s") for n in (10, 20))
+    content = encode_motion_file(msgspec.structs.replace(file, horizons=horizons, windows=windows))
+    assert len(content) <= 64 * 1024
 
 
 def test_the_order_of_recordings_does_not_change_the_file(file: MotionFile) -> None:
