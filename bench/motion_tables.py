@@ -136,15 +136,27 @@ def alignment() -> str:
 
 
 def costs() -> str:
-    """One row for each set: processor time and size."""
+    """One row for each set: processor time, memory and size."""
     return table(
-        ["set", "poses", "`conformalize`, s", "`annotate`, us a pose", "file, bytes"],
+        [
+            "set",
+            "poses",
+            "`conformalize`, s",
+            "MiB",
+            "`annotate`, us a pose",
+            "MiB",
+            "`MotionTracker.step`, us",
+            "file, bytes",
+        ],
         [
             [
                 found["set"],
                 f"{found['costs']['poses']:,}",
                 f"{found['costs']['conformalize_s']:.2f}",
+                f"{found['costs']['conformalize_mib']:.0f}",
                 f"{found['costs']['annotate_us']:.0f}",
+                f"{found['costs']['annotate_mib']:.0f}",
+                f"{found['costs']['step_us']:.0f}",
                 f"{found['costs']['bytes']:,}",
             ]
             for found in results()
