@@ -72,7 +72,8 @@ class Block:
     @property
     def commands(self) -> list[list[str]]:
         text = self.text.replace("\\\n", " ")
-        split = [shlex.split(line, comments=True) for line in text.splitlines()]
+        lines = [part for line in text.splitlines() for part in line.split(" | ")]
+        split = [shlex.split(line, comments=True) for line in lines]
         return [words for words in split if words]
 
 
