@@ -1,4 +1,4 @@
-"""Tubes: bounds around the estimate that grow from an anchor on, and hold the whole window.
+"""Tubes: bounds around the estimate from an anchor on that hold the whole window.
 
 Intervals of single horizons hold at one time each; all at once they hold far less often. A tube
 belongs to a window of seconds or metres after an anchor, a pose that is known. With the residual x
