@@ -144,7 +144,9 @@ class OnRay:
                 self._ray.wait([reference])
                 self._watch(self._what, count, len(self))
         try:
-            return list(self._ray.get(self._references))
+            # All together, ``get`` raises the error that came first in time.
+            self._ray.wait(self._references, num_returns=len(self))
+            return [self._ray.get(reference) for reference in self._references]
         except self._ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, CvoError):
                 raise error.cause from None
