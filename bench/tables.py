@@ -21,6 +21,7 @@ import accuracy_tables
 import comparison_tables
 import localiser_tables
 import motion_tables
+import odometry_tables
 import promised_table
 import reconstruct_tables
 import recording_tables
@@ -54,6 +55,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **vigilance_tables.TABLES,
     **promised_table.TABLES,
     **motion_tables.TABLES,
+    **odometry_tables.TABLES,
     **recording_tables.TABLES,
     **reconstruct_tables.TABLES,
     "faults": faults,

@@ -30,10 +30,17 @@ if TYPE_CHECKING:
         UsageError,
     )
     from cvo_edge.estimate import PoseInterval, Reason, Record, Status
+    from cvo_edge.frontend.odometry import FrontEnd
+    from cvo_edge.frontend.steps import Step, StepReason
     from cvo_edge.input.frame import Frame
     from cvo_edge.input.sources import open_source
     from cvo_edge.motion.intervals import MotionCalibration
-    from cvo_edge.motion.records import MotionInterval, MotionReason, MotionRecord
+    from cvo_edge.motion.records import (
+        MotionDirection,
+        MotionInterval,
+        MotionReason,
+        MotionRecord,
+    )
     from cvo_edge.motion.tracker import MotionTracker
     from cvo_edge.odometer import Odometer
     from cvo_edge.output.records import Header, Records, read_records
@@ -53,11 +60,13 @@ __all__ = [
     "CvoError",
     "Ellipsoids",
     "Frame",
+    "FrontEnd",
     "GateError",
     "Header",
     "ModelCache",
     "ModelError",
     "MotionCalibration",
+    "MotionDirection",
     "MotionInterval",
     "MotionReason",
     "MotionRecord",
@@ -71,6 +80,8 @@ __all__ = [
     "SinkError",
     "SourceError",
     "Status",
+    "Step",
+    "StepReason",
     "UsageError",
     "open_source",
     "read_bundle",
@@ -89,11 +100,13 @@ _HOMES = {
     "CvoError": "errors",
     "Ellipsoids": "sets",
     "Frame": "input.frame",
+    "FrontEnd": "frontend.odometry",
     "GateError": "errors",
     "Header": "output.records",
     "ModelCache": "engine.model_cache",
     "ModelError": "errors",
     "MotionCalibration": "motion.intervals",
+    "MotionDirection": "motion.records",
     "MotionInterval": "motion.records",
     "MotionReason": "motion.records",
     "MotionRecord": "motion.records",
@@ -107,6 +120,8 @@ _HOMES = {
     "SinkError": "errors",
     "SourceError": "errors",
     "Status": "estimate",
+    "Step": "frontend.steps",
+    "StepReason": "frontend.steps",
     "UsageError": "errors",
     "open_source": "input.sources",
     "read_bundle": "engine.loading",

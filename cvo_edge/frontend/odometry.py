@@ -46,6 +46,7 @@ class FrontEnd:
         self._lengths = lengths
         self._before: Grey | None = None
         self._stamp_ns: int | None = None
+        self._size: tuple[int, int] | None = None
         self._seq = 0
         self._turn = np.eye(3)
         self._t = np.zeros(3)
@@ -70,6 +71,7 @@ class FrontEnd:
         before, self._before = self._before, None
         earlier_ns, self._stamp_ns = self._stamp_ns, frame.stamp_ns
         image = grey(frame.image)
+        self._size = None if image is None else (image.shape[0], image.shape[1])
         if image is None:
             return self._lost(frame, seq, StepReason.IMAGE_UNREADABLE)
         if image.shape != (self.camera.height, self.camera.width):
@@ -98,7 +100,8 @@ class FrontEnd:
     def _lost(self, frame: Frame, seq: int, reason: StepReason, tracks: int = 0) -> Step:
         self._turn = np.eye(3)
         nowhere = np.full(7, np.nan)
-        return Step(seq, frame.stamp_ns, frame.source, (reason,), tracks, None, None, nowhere)
+        size = self._size
+        return Step(seq, frame.stamp_ns, frame.source, (reason,), tracks, None, None, nowhere, size)
 
     def _step(
         self,
@@ -118,7 +121,10 @@ class FrontEnd:
             turn = geometry.matrix_to_quaternion(motion.R)
             self._q = geometry.quaternion_normalise(geometry.quaternion_multiply(self._q, turn))
         pose = np.concatenate([self._t, self._q])
-        return Step(seq, frame.stamp_ns, frame.source, reasons, tracks, motion, length_m, pose)
+        size = self._size
+        return Step(
+            seq, frame.stamp_ns, frame.source, reasons, tracks, motion, length_m, pose, size
+        )
 
 
 def grey(image: object) -> Grey | None:

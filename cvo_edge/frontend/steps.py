@@ -48,6 +48,8 @@ class Step:
     pose
         Shape (7,): the steps added up, from the first image on, tx ty tz qx qy qz qw; NaN if the
         step is lost. Without lengths, a step with a direction counts as 1.
+    size
+        Height and width of the image; None without one.
     """
 
     seq: int
@@ -58,6 +60,7 @@ class Step:
     motion: Motion | None
     length_m: float | None
     pose: Array
+    size: tuple[int, int] | None
 
     @property
     def status(self) -> Status:

@@ -155,6 +155,8 @@ def _lengths(path: Path, fps: float | None) -> Lengths:
     from cvo_edge.trajectories.interpolation import Track
 
     poses = read_poses(path).stamped(None, fps)
+    if poses.unscaled:
+        raise UsageError(f"--scale: expected a trajectory in metres, found {path} without a scale")
     track = Track(poses.stamps_ns, poses.poses)
     usual_ns = float(np.median(np.diff(poses.stamps_ns))) if len(poses.stamps_ns) > 1 else 0.0
     bound_ns = round(max(_NEAR_NS, usual_ns))
@@ -229,10 +231,11 @@ def _check(step: Step, source: str, camera: Camera, *, stamped: bool) -> None:
             f"{shown(source)}: expected a stamp for every frame, {step.source or 'a frame'} has "
             "none; give --fps or --stamps"
         )
-    if step.seq == 0 and StepReason.IMAGE_SIZE in step.reasons:
+    if step.seq == 0 and StepReason.IMAGE_SIZE in step.reasons and step.size is not None:
+        found = "{1}x{0}".format(*step.size)
         raise UsageError(
             f"{shown(source)}: expected images of {camera.width}x{camera.height} pixels, the size "
-            f"of the camera, found another; give the intrinsics for the images' size"
+            f"of the camera, found {found}; give the intrinsics of these images"
         )
 
 

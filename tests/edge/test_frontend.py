@@ -270,3 +270,38 @@ def test_what_cannot_be_is_said_in_one_line(
     assert found == code
     assert message in output
     assert "\n" not in output.strip()
+
+
+def test_the_whole_chain_puts_intervals_on_rotation_and_direction(tmp_path: Path) -> None:
+    pairs: list[Path] = []
+    for part in range(2):
+        folder = tmp_path / f"part-{part}"
+        folder.mkdir()
+        rows = ""
+        for seq, image in enumerate(sorted(CLIP.glob("*.color.jpg"))[25 * part : 25 * part + 25]):
+            (folder / image.name).symlink_to(image)
+            pose = read_pose_matrix(image.with_name(image.name.replace("color.jpg", "pose.txt")))
+            assert pose is not None
+            rows += " ".join(map(str, [seq / 30, *pose.tolist()])) + "\n"
+        steps, truth = tmp_path / f"steps-{part}.tum", tmp_path / f"truth-{part}.tum"
+        truth.write_text(rows)
+        options = ("--camera", CAMERA, "--fps", 30, "--quiet")
+        assert run("odometry", folder, *options, "-o", steps) == (0, "")
+        pairs += [steps, truth]
+    intervals = tmp_path / "motion.json"
+    code, report = run("conformalize", *pairs, "-o", intervals, "--scale", "inliers,parallax")
+    assert (code, "not compared, as the drives are too short" in report) == (0, True)
+    output = tmp_path / "records.jsonl"
+    assert run("odometry", CLIP, *options, "--motion", intervals, "-o", output) == (0, "")
+    head, _, *records = map(json.loads, output.read_text().splitlines())
+    assert head["motion"]["horizons"] == ["1f"]
+    for record in records:
+        (found,) = record["motion"]
+        assert found["bounded"] == (record["status"] == "ok")
+        if found["direction"] is not None:
+            assert np.allclose(found["direction"]["xyz"], record["direction"], atol=1e-6)
+            assert found["rotation"] > 0.0
+    # Another estimator's thresholds are not for steps in metres.
+    wheels = tmp_path / "truth-0.tum"
+    code, text = run("odometry", CLIP, *options, "--motion", intervals, "--scale", wheels)
+    assert (code, "expected steps without a scale" in text) == (2, True)
