@@ -23,8 +23,10 @@ _TOP, _MOST_LEVELS = 30, 6
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02)
 # A point that is followed back has to come this near to where it was, pixels.
 _BACK = 1.0
-# Logarithm of a gain, and grey levels, that make no difference.
-_SAME_GAIN, _SAME_MEAN = 0.02, 2.0
+# Parts of an image whose brightness is compared, and the grey level below which a part is dark.
+_PARTS, _DARK = (32, 24), 8.0
+# Logarithm of a gain that makes no difference.
+_SAME_GAIN = 0.02
 
 
 class Tracks(NamedTuple):
@@ -44,21 +46,23 @@ def corners(image: Grey) -> Points:
 
 
 def as_bright(image: Grey, other: Grey) -> Grey:
-    """Return an image with the mean and the spread of grey levels of another one.
+    """Return an image with the exposure of another one.
 
-    Lucas-Kanade takes a point's brightness for constant, and cameras change their exposure.
+    Lucas-Kanade takes a point's brightness for constant, and cameras change their exposure. The
+    gain is the median over parts of the image: a shadow or a cover over some of it changes nothing.
     """
-    (mean, spread), (wanted, wanted_spread) = map(_levels, (image, other))
-    gain = wanted_spread / max(spread, 1.0)
-    if abs(math.log(max(gain, 1e-3))) < _SAME_GAIN and abs(mean - wanted) < _SAME_MEAN:
+    parts = [
+        cv2.resize(each, _PARTS, interpolation=cv2.INTER_AREA).astype(np.float64)
+        for each in (image, other)
+    ]
+    seen = (parts[0] > _DARK) & (parts[1] > _DARK)
+    if not seen.any():
         return image
-    levels = np.rint((np.arange(256) - mean) * gain + wanted)
-    return np.asarray(cv2.LUT(image, np.clip(levels, 0, 255).astype(np.uint8)), np.uint8)
-
-
-def _levels(image: Grey) -> tuple[float, float]:
-    mean, spread = cv2.meanStdDev(image)
-    return float(mean[0, 0]), float(spread[0, 0])
+    gain = float(np.median(parts[1][seen] / parts[0][seen]))
+    if abs(math.log(gain)) < _SAME_GAIN:
+        return image
+    levels = np.rint(gain * np.arange(256))
+    return np.asarray(cv2.LUT(image, np.minimum(levels, 255).astype(np.uint8)), np.uint8)
 
 
 def follow(before: Grey, after: Grey, points: Points) -> Tracks:

@@ -208,6 +208,16 @@ def test_another_exposure_changes_no_rotation() -> None:
     assert off(*turns) < 2e-4
 
 
+def test_a_cover_over_half_of_the_image_moves_nothing() -> None:
+    image = texture()
+    front = FrontEnd(camera())
+    front.step(image)
+    step = front.step(np.where(np.arange(320) < 150, image, 0).astype(np.uint8))
+    assert step.motion is not None
+    assert step.motion.direction is None
+    assert off(step.motion.R, np.eye(3)) < 1e-4
+
+
 def run(*words: object) -> tuple[int, str]:
     result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=True)
     error = result.exception
