@@ -53,6 +53,8 @@ _LEAST_NOISE = 1e-9
 _AT_ONCE = 16
 # A body whose usual rotation (rad) and translation (m) in half a second are below these stands.
 _LEAST_MOTION = np.array([2e-3, 2e-3])
+# If more than this share of motions stand, they are left out: those that fit best would be still.
+_MOST_STILL = 0.5
 
 
 class Alignment(NamedTuple):
@@ -179,6 +181,9 @@ class _Pair:
             # Keyframes, at odd times: hardly two of them are half a second apart.
             start = np.where(np.diff(along, prepend=-np.inf) <= _WIDEST * usual_s, every - 1, -1)
         end = np.flatnonzero(start >= 0)
+        still = _stand(_twists(motion(estimate[start[end]], estimate[end])))
+        if still.sum() > _MOST_STILL * len(still):
+            end = end[~still]
         end = end[:: max(1, len(end) // _MOST_MOTIONS)]
         self._stamps_ns = np.concatenate([stamps_ns[start[end]], stamps_ns[end]])
         self._truth = truth
@@ -285,6 +290,11 @@ def _fits(off: Array) -> Mask:
 def _rates(twists: _Twists) -> Array:
     """Return the sizes (2, n) of rotations and translations."""
     return np.sqrt([np.einsum("ij,ij->i", each, each) for each in twists])
+
+
+def _stand(twists: _Twists) -> Mask:
+    """Return in which motions (n,) the body neither turns nor moves."""
+    return np.asarray((_rates(twists) < _LEAST_MOTION[:, np.newaxis]).all(axis=0))
 
 
 def _mismatch(moved: Array, true: Array) -> float:

@@ -21,6 +21,8 @@ _AXES = "xyz"
 _DOUBT = (0.3, 0.1)
 # More pairs than this are reported by their spread, and with so many that stand out.
 _MOST_LINES, _MOST_ODD = 30, 10
+# Time offsets that differ by more have no middle worth telling.
+_ALIKE_S = 0.02
 
 
 def fit_lines(fits: Sequence[Fit], made: Sequence[str]) -> Iterator[str]:
@@ -144,7 +146,10 @@ def _what(found: Sequence[Fit], correction: MotionCorrection) -> str:
     if correction == "time":
         offsets = [fit.alignment.offset_s for fit in found]
         period_s = float(np.median([fit.period_s for fit in found]))
-        middle = float(np.median(offsets))
+        least, middle, most = min(offsets), float(np.median(offsets)), max(offsets)
+        frames = max(abs(least), abs(most)) / period_s
+        if most - least > _ALIKE_S:
+            return f"stamps differ by {least:.3f} .. {most:.3f} s (up to {frames:.1f} frames)"
         return f"stamps differ by {middle:.3f} s ({abs(middle) / period_s:.1f} frames)"
     if correction == "frame":
         turns = [np.linalg.norm(fit.alignment.determined_rotation) for fit in found]

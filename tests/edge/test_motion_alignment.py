@@ -8,6 +8,9 @@ import pytest
 from cvo_edge import geometry
 from cvo_edge.motion.alignment import align
 from cvo_edge.motion.corrections import corrected, fit_of
+from cvo_edge.programs.motion_report import fit_lines
+from cvo_edge.programs.trajectories import fits
+from cvo_edge.spread import Here
 from cvo_edge.trajectories.interpolation import Track
 
 from .simulated_drives import PERIOD_NS, chained, composed, drive, twist
@@ -72,6 +75,27 @@ def test_a_body_that_stands_gives_no_alignment() -> None:
     stamps = PERIOD_NS * np.arange(20)
     poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (20, 1))
     assert align(stamps, poses, Track(stamps, poses)) is None
+
+
+def test_a_body_that_stands_for_most_of_a_drive_is_aligned() -> None:
+    pair = drive(1, 600, noise=0.3)
+    # It stands, without errors, for four fifths of the time.
+    place = np.concatenate([np.arange(300), np.full(2400, 300), np.arange(300, 601)])
+    stamps = PERIOD_NS * np.arange(len(place))
+    late = stamps + 50_000_000
+    found = align(late, pair.estimate[place], Track(stamps, pair.truth[place]))
+    assert found is not None
+    assert abs(found.offset_s + 0.05) < 0.004
+    assert abs(found.scale - 1.0) < 0.01
+    assert found.misfit.min() > 1e-3
+
+
+def test_offsets_that_differ_are_told_by_their_range() -> None:
+    pairs = [drive(seed, 300, noise=0.3) for seed in (1, 2)]
+    shifts = zip(pairs, (50_000_000, -50_000_000), strict=True)
+    late = [replace(pair, stamps_ns=pair.stamps_ns + shift) for pair, shift in shifts]
+    (told,) = (line for line in fit_lines(fits(Here(late)), ()) if line.startswith("time: "))
+    assert "-0.050 .. 0.050 s (up to 1.0 frames) in 2 of 2" in told
 
 
 def test_corrections_do_not_touch_the_estimates_own_axes() -> None:
