@@ -44,6 +44,8 @@ _WIDTHS: dict[int, TrajectoryFormat] = {
 _FORMS = (
     f"tum ({tum.FORM}), openvins (20 columns), kitti (12 numbers) or euroc (columns with commas)"
 )
+# Steps without a scale are rounded to a few digits.
+_LEAST_STEP, _STEP_TOLERANCE = 1e-6, 0.05
 # Deviations of position and rotation by OpenVINS' covariances: names of columns to scale by.
 _DEVIATIONS = ("position_deviation", "rotation_deviation")
 
@@ -165,8 +167,11 @@ def read_poses(path: Path, format: TrajectoryFormat | None = None) -> PoseFile:
     columns = dict(zip(names[len(tum.FORM.split()) :], others.T, strict=True))
     if found == "openvins":
         columns = _deviations(columns)
+    read = _read(path, found, trajectory, columns)
     unscaled = any(map(says_unscaled, _comments(path)))
-    return replace(_read(path, found, trajectory, columns), unscaled=unscaled)
+    if unscaled:
+        _check_steps(path, read.poses)
+    return replace(read, unscaled=unscaled)
 
 
 def _format(path: Path, line: str) -> TrajectoryFormat | None:
@@ -195,6 +200,18 @@ def says_unscaled(comment: str) -> bool:
     """Whether a comment says that steps have no length: ``# scale: none``."""
     words = comment.lstrip(" #").replace(",", " ").split()
     return words[:2] == ["scale:", "none"]
+
+
+def _check_steps(path: Path, poses: Array) -> None:
+    """Raise SourceError for poses (n, 7) without a scale whose usual step is not of length 1."""
+    steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+    steps = steps[steps > _LEAST_STEP]
+    usual = float(np.median(steps)) if len(steps) else 1.0
+    if abs(usual - 1.0) > _STEP_TOLERANCE:
+        raise SourceError(
+            f"{path}: expected steps of length 1, or 0 without a direction, after # scale: none, "
+            f"found a median of {usual:.3g}; divide each step by its length"
+        )
 
 
 def tum_names(comment: str) -> list[str]:

@@ -143,5 +143,10 @@ def test_files_say_that_they_have_no_scale(tmp_path: Path) -> None:
     assert (code, "expected steps without a scale" in text) == (2, True)
     code, text = run("conformalize", files[1], files[0], "-o", tmp_path / "b.json")
     assert (code, "expected a truth in metres" in text) == (2, True)
+    longer = np.loadtxt(files[0])
+    longer[:, 1:4] *= 3.0
+    np.savetxt(tmp_path / "long.tum", longer, fmt="%.9f", header="scale: none")
+    code, text = run("annotate", tmp_path / "long.tum", motion_file)
+    assert (code, "after # scale: none, found a median of 3" in text) == (6, True)
     code, text = run("annotate", files[0], motion_file, "--format", "csv")
     assert (code, "expected jsonl or tum" in text) == (2, True)
