@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cvo_edge.errors import SourceError
 from cvo_edge.motion.errors import recent_rows
 from cvo_edge.motion.kept import Kept
 from cvo_edge.motion.recordings import Recording
@@ -93,20 +94,35 @@ def _whole_second(rows: Rows, recent: Integers, ends: Integers) -> NDArray[np.bo
 
 
 def fit_familiar(recordings: Spread[Recording], period_s: float) -> Familiar:
-    """Return mean, spread and limit of calibrated drives; drives count equally."""
-    mean = np.mean(recordings.map(_moments).collect(), axis=0)
-    square = np.mean(recordings.map(partial(_moments, about=mean)).collect(), axis=0)
+    """Return mean, spread and limit of calibrated drives; drives count equally.
+
+    Raises SourceError if no drive has a second without a break.
+    """
+    means = [each for each in recordings.map(_moments).collect() if each is not None]
+    if not means:
+        raise SourceError(
+            "conformalize: expected a drive with a second of poses without a gap or a jump, found "
+            "none"
+        )
+    mean = np.mean(means, axis=0)
+    squares = recordings.map(partial(_moments, about=mean)).collect()
+    square = np.mean([each for each in squares if each is not None], axis=0)
     open_ended = Familiar(mean, np.maximum(np.sqrt(square), _LEAST), np.inf)
     largest = recordings.map(partial(_largest, familiar=open_ended, period_s=period_s)).collect()
     return open_ended._replace(limit=max(largest))
 
 
-def _moments(recording: Recording, about: Array | None = None) -> Array:
-    """Return the mean of the numbers (k,), or that of their squares about another one."""
+def _moments(recording: Recording, about: Array | None = None) -> Array | None:
+    """Return the mean of the numbers (k,), or that of their squares about another one.
+
+    None if no second is whole.
+    """
     rows = recording.rows
     ends = np.arange(len(rows.part))
     recent = recent_rows(rows, ends)
     ends = ends[_whole_second(rows, recent, ends)]
+    if not len(ends):
+        return None
     numbers = recent_numbers(rows, recent[ends], ends)
     return np.asarray((numbers if about is None else (numbers - about) ** 2).mean(axis=0))
 

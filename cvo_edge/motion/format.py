@@ -253,9 +253,11 @@ def _positive(matrix: NDArray[np.float64]) -> bool:
 
 def _check_name(where: str, name: str) -> None:
     try:
-        Horizon.parse(name)
+        plain = str(Horizon.parse(name)) == name
     except UsageError:
-        raise CalibrationFileError(f"{where}: expected e.g. 1f, 5s or 100m") from None
+        plain = False
+    if not plain:
+        raise CalibrationFileError(f"{where}: expected e.g. 1f, 5s or 100m")
 
 
 def _check_scale(where: str, scale: ScaleSpec, width: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Real
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -37,6 +38,7 @@ Measure = TypeVar("Measure")
 
 # A robot at another rate needs a calibration of its own for horizons in frames.
 SAME_RATE = 0.2
+_SAME_LEVEL = 1e-6
 
 
 class Intervals(NamedTuple):
@@ -239,7 +241,11 @@ class MotionCalibration:
         self, confidence: float = 0.9, rule: MotionRule = "mean", scope: Scope = "marginal"
     ) -> Level:
         """Return a level of the file; raises UsageError for others."""
-        if isinstance(confidence, bool) or confidence not in LEVELS:
+        stored = None
+        if isinstance(confidence, Real) and not isinstance(confidence, bool):
+            # Of float32, 0.9 is 0.8999999761581421.
+            stored = next((each for each in LEVELS if abs(each - confidence) < _SAME_LEVEL), None)
+        if stored is None:
             raise UsageError(
                 f"confidence: expected one of {', '.join(f'{c:g}' for c in LEVELS)}, found "
                 f"{shown(confidence)}"
@@ -249,7 +255,7 @@ class MotionCalibration:
                 raise UsageError(
                     f"{name}: expected one of {', '.join(known)}, found {shown(value)}"
                 )
-        return Level(float(confidence), rule, scope)
+        return Level(stored, rule, scope)
 
     def scaled(self, poses: Array) -> Array:
         """Return poses (n, 7) with the correction of the scale."""

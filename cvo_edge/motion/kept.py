@@ -16,7 +16,7 @@ from cvo_edge.errors import UsageError
 from cvo_edge.motion.relative import between, rotation_vector
 from cvo_edge.motion.trace import MEANS, RECENT_NS, Limits
 from cvo_edge.pose import Pose
-from cvo_edge.trajectories.poses import FARTHEST_M, unit_quaternion
+from cvo_edge.trajectories.poses import FARTHEST_M, TOLERANCE, unit_quaternion
 
 # Poses that are kept at most: a horizon of 100 m is long for a robot that stands.
 KEPT = 1 << 16
@@ -134,7 +134,8 @@ def _two_sizes(twist: Sequence[float]) -> tuple[float, float]:
 def seven(pose: Pose | ArrayLike | None) -> tuple[float, ...]:
     """Return a pose (7,), NaN if it is none; raises UsageError for what is not seven numbers.
 
-    Numbers that are no pose of a robot (not finite, no quaternion, beyond 1e9 m) count as none.
+    Numbers that are no pose of a robot (not finite, a quaternion of another norm than 1, beyond
+    1e9 m) count as none.
     """
     if pose is None:
         return _MISSING
@@ -149,9 +150,9 @@ def seven(pose: Pose | ArrayLike | None) -> tuple[float, ...]:
         ) from None
     a, b, c, d = q
     square = a * a + b * b + c * c + d * d
-    # Comparisons with NaN are false.
+    # Comparisons with NaN are false. As in files, norms within TOLERANCE of 1 are rounding.
     near = abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and abs(z) < FARTHEST_M
-    if not (near and 0.0 < square < math.inf):
+    if not (near and abs(math.sqrt(square) - 1.0) <= TOLERANCE):
         return _MISSING
     return (x, y, z, *unit_quaternion(q))
 

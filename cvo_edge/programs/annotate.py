@@ -91,7 +91,8 @@ def _lines(
         raise SourceError("standard input: expected lines of poses, found it closed")
     names, started, unscaled = FORM.split(), False, False
     for number, line in enumerate(sys.stdin.buffer, start=1):
-        text = line.decode("utf-8", "replace").strip()
+        # A byte order mark, as some editors put it before the first line.
+        text = line.decode("utf-8-sig" if number == 1 else "utf-8", "replace").strip()
         if not text or text.startswith("#"):
             names = names if started else tum_names(text) or names
             unscaled |= not started and says_unscaled(text)

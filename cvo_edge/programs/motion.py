@@ -349,9 +349,11 @@ def audit(
         raise UsageError("--picture: expected a calibration in metres, found one without a scale")
     named = listed_files(given, pairs, [])
     read = [path for each in named for path in each.paths]
+    others: list[Path | str | None] = [motion, pairs, times]
     for written in (json_file, picture):
         if written is not None:
-            refuse_overwriting(str(written), *read, motion, pairs, times)
+            refuse_overwriting(str(written), *read, *others)
+            others.append(written)
     pairs_read = read_pairs(named, Reading(format, times, fps)).pairs
     if wanted:
         pairs_read, _ = correct_pairs(pairs_read, fits(pairs_read), wanted)

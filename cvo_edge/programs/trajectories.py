@@ -91,7 +91,8 @@ def listed_files(given: Sequence[Path], pairs: Path | None, groups: Sequence[str
     if pairs is not None:
         files += _listed(pairs)
     if not files:
-        raise UsageError("files: expected EST GT [EST GT ...] or --pairs FILE, found none")
+        found = "none" if pairs is None else f"no line in {pairs}"
+        raise UsageError(f"files: expected EST GT [EST GT ...] or --pairs FILE, found {found}")
     if groups:
         if len(groups) != len(files):
             raise UsageError(

@@ -21,7 +21,7 @@ MATRIX_SUFFIX = ".pose.txt"
 _MAX_MATRIX_BYTES = 1 << 16
 
 # Files round quaternions and matrices to a few digits.
-_TOLERANCE = 0.01
+TOLERANCE = 0.01
 _LAST_ROW = 1e-6
 # Squares of quaternions that are divided by their norm are one up to this.
 _UNIT = 1e-15
@@ -44,7 +44,7 @@ def quaternion_poses(positions_m: Array, q_xyzw: Array) -> tuple[list[Array | No
     """Do the same for positions (n, 3) and quaternions (n, 4); faults are "" for valid poses."""
     with np.errstate(all="ignore"):
         norms = np.linalg.norm(q_xyzw, axis=1)
-        valid = (np.abs(norms - 1.0) <= _TOLERANCE) & (np.abs(positions_m) < FARTHEST_M).all(axis=1)
+        valid = (np.abs(norms - 1.0) <= TOLERANCE) & (np.abs(positions_m) < FARTHEST_M).all(axis=1)
         every = np.concatenate([positions_m, _unit(q_xyzw)], axis=1)
     poses = [pose if fine else None for pose, fine in zip(every, valid.tolist(), strict=True)]
     faults = [
@@ -83,7 +83,7 @@ def quaternion_fault(position_m: Array, q_xyzw: Array) -> str | None:
         return fault
     with np.errstate(over="ignore"):
         norm = float(np.linalg.norm(q_xyzw))
-    return None if abs(norm - 1.0) <= _TOLERANCE else f"a quaternion of norm {norm:.3g}"
+    return None if abs(norm - 1.0) <= TOLERANCE else f"a quaternion of norm {norm:.3g}"
 
 
 def _position_fault(position_m: Array) -> str | None:
@@ -121,7 +121,7 @@ def matrices_to_poses(T: Array) -> tuple[list[Array | None], list[str]]:
     with np.errstate(invalid="ignore"):
         off = np.abs(R - T[:, :3, :3]).max(axis=(1, 2))
         near = (np.abs(T[:, :3, 3]) < FARTHEST_M).all(axis=1)
-        valid = whole & near & (off <= _TOLERANCE)
+        valid = whole & near & (off <= TOLERANCE)
     valid &= np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) <= _LAST_ROW
     poses = [pose if fine else None for pose, fine in zip(every, valid.tolist(), strict=True)]
     faults = [
@@ -138,7 +138,7 @@ def matrix_fault(T: Array) -> str | None:
     if (fault := _position_fault(T[:3, 3])) is not None:
         return fault
     off = float(np.abs(geometry.nearest_rotation(T[:3, :3]) - T[:3, :3]).max())
-    if off > _TOLERANCE:
+    if off > TOLERANCE:
         return f"a matrix {off:.3g} away from a rotation"
     if np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() > _LAST_ROW:
         return "a last row other than 0 0 0 1"

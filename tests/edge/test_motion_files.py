@@ -35,6 +35,7 @@ from cvo_edge.motion.trace import scale_width
 from cvo_edge.motion.tracker import MotionTracker
 from cvo_edge.programs.cli import app
 from cvo_edge.spread import Here
+from cvo_edge.trajectories.interpolation import Track
 from cvo_edge.vocabulary import MOTION_RULES, MotionCovariance
 
 from .simulated_drives import PERIOD_NS, drive
@@ -118,6 +119,29 @@ def test_a_changed_file_is_refused(file: MotionFile, key: str, value: object, me
     signed = plain.replace(b"0" * 64, sha256(plain).hexdigest().encode(), 1)
     with pytest.raises(CalibrationFileError, match=message):
         decode_motion_file(signed)
+
+
+def test_a_horizon_has_one_name(file: MotionFile) -> None:
+    twice = msgspec.structs.replace(file.horizons[0], horizon=f"0{file.horizons[0].horizon}")
+    with pytest.raises(CalibrationFileError, match=r"expected e\.g\. 1f"):
+        encode_motion_file(msgspec.structs.replace(file, horizons=(twice, *file.horizons)))
+
+
+def test_a_drive_without_a_whole_second_does_not_spoil_others() -> None:
+    pairs = [drive(seed, 100) for seed in range(3)]
+    gaps = 10**10 * (np.arange(101) // 10)
+    short = [
+        replace(
+            pair,
+            stamps_ns=pair.stamps_ns + gaps,
+            track=Track(pair.track.stamps_ns + gaps, pair.track.poses),
+        )
+        for pair in pairs
+    ]
+    file = conformalize(Here([*pairs, short[0]]), "test", [Horizon.parse("1f")], [])
+    assert np.isfinite(file.familiar.mean).all()
+    with pytest.raises(SourceError, match="expected a drive with a second of poses"):
+        conformalize(Here(short), "test", [Horizon.parse("1f")], [])
 
 
 def test_every_changed_byte_is_noticed(file: MotionFile) -> None:
@@ -359,13 +383,16 @@ def test_wrong_poses_are_refused(calibration: MotionCalibration) -> None:
         with pytest.raises(UsageError, match=r"^stamp: expected"):
             tracker.step(stamp, None)
     # What an estimator that is lost may send, and no number of it was used up above.
-    for seq, lost in enumerate((None, [0.0] * 7, [np.nan] * 7, [1e200] * 3 + [0, 0, 0, 1])):
+    for seq, lost in enumerate(
+        (None, [0.0] * 7, [np.nan] * 7, [1e200] * 3 + [0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 3])
+    ):
         record = tracker.step(seq + 1, lost)
         assert (record.seq, record.status) == (seq, Status.INVALID)
         assert record.reasons == (MotionReason.POSE_MISSING,)
     for level in ({"confidence": 0.7}, {"rule": "best"}, {"scope": "all"}, {"covariance": "full"}):
         with pytest.raises(UsageError, match=r": expected "):
             MotionTracker(calibration, **level)
+    assert MotionTracker(calibration, np.float32(0.9)).level == calibration.level(0.9)
 
 
 def test_a_clock_that_is_set_back_begins_anew(calibration: MotionCalibration) -> None:
@@ -428,7 +455,8 @@ def test_a_column_that_is_no_number_is_a_pose_that_is_missing(tmp_path: Path) ->
     whole, piped = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
     assert run("annotate", estimate, motion, "-o", whole)[0] == 0
     words = ["annotate", "-", str(motion), "-o", str(piped)]
-    assert CliRunner().invoke(app, words, input=estimate.read_text()).exit_code == 0
+    for mark in ("", "\ufeff"):
+        assert CliRunner().invoke(app, words, input=mark + estimate.read_text()).exit_code == 0
     assert piped.read_bytes() == whole.read_bytes()
     refused = CliRunner().invoke(app, words, input=estimate.read_text().partition("\n")[2])
     assert "found no column inliers" in str(refused.exception)
@@ -561,6 +589,7 @@ def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -
     large = np.loadtxt(one[0])
     large[:, 1:4] *= 1000.0
     np.savetxt(tmp_path / "mm.tum", large, fmt="%.9f")
+    (tmp_path / "no.txt").write_text("# nothing yet\n")
     (tmp_path / "corrupt.json").write_bytes(motion.read_bytes()[:-40])
     output = ["-o", tmp_path / "out.json"]
     cases = [
@@ -580,6 +609,8 @@ def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -
         (["conformalize", one[0], other[1], *other, *output], 6, "that do not fit"),
         (["conformalize", one[1], one[1], *other, *output], 6, "the same motions in both"),
         (["audit", *one, motion, "--picture", "a.jpg"], 2, "--picture: expected"),
+        (["audit", *one, motion, "--picture", "a.png", "--json", "a.png"], 2, "among the inputs"),
+        (["conformalize", "--pairs", tmp_path / "no.txt", *output], 2, "no line in"),
         (["annotate", one[0], motion, "-o", "a.csv", "--covariance", "interval"], 2, "jsonl"),
         (["audit", *one, tmp_path / "corrupt.json"], 3, "corrupt.json"),
         (["audit", *one, tmp_path / "none.json"], 3, "no such file"),
