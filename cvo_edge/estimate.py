@@ -15,7 +15,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.errors import UsageError, printable
-from cvo_edge.pose import Chart, Pose, Rotation
+from cvo_edge.pose import Chart, Pose, Rotation, as_pose
 from cvo_edge.sets import Bands, ConformalSet, Ellipsoids
 from cvo_edge.vocabulary import Scope
 
@@ -234,22 +234,70 @@ class PoseInterval:
         return self.conformal_set.contains(self._coordinates(pose))
 
     def _coordinates(self, pose: Pose | ArrayLike) -> Array:
-        if self.pose is None:
-            raise UsageError(f"frame {self.seq} is invalid: it has no pose and no set")
-        other = pose if isinstance(pose, Pose) else Pose.from_array(pose)
-        return self.chart.coordinates(other.to_array(), self.pose.to_array())
+        return self.chart.coordinates(as_pose(pose).to_array(), self._known_pose().to_array())
 
-    def covariance(self) -> Array:
-        """Return a diagonal matrix (6, 6): (half-width / z)^2 in m^2 and rad^2, may be infinite.
+    def covariance(
+        self,
+        frame: Literal["world", "chart"] = "world",
+        *,
+        T_camera_base: Pose | ArrayLike | None = None,
+        T_map_world: Pose | ArrayLike | None = None,
+    ) -> Array:
+        """Return second moments of the error of ``pose``, (6, 6) in m^2, m rad and rad^2.
 
-        z is the normal quantile of the stated confidence. This is a convention for filters that
-        need a covariance; the guarantee holds only for the set.
+        A convention for filters, see ``cvo_edge.covariance``; the guarantee is that of the set.
+        ``world``: x y z, then rotations about the fixed axes of the header's frame, as in
+        ``geometry_msgs/PoseWithCovariance``; ``chart``: in the six numbers of the set. Without a
+        bounded set, the diagonal is infinite, which no filter takes: ask ``bounded`` first.
+
+        Parameters
+        ----------
+        frame
+            Axes of the result.
+        T_camera_base, T_map_world
+            Pose or shape (7,): where the robot's base is in the camera, and the world in the map;
+            the result is that of ``pose_of`` with the same two, for ``world`` only.
+
+        Raises UsageError for an invalid frame, and for a base or map with ``chart``.
         """
         # Imported here because it also loads fractions and decimal, which few programs need.
-        from statistics import NormalDist
+        from cvo_edge import covariance
 
-        z = NormalDist().inv_cdf(0.5 + 0.5 * self.confidence)
-        return np.diag(((self.upper - self.lower) / (2.0 * z)) ** 2)
+        if frame not in ("world", "chart"):
+            raise UsageError(f"frame: expected world or chart, found {frame!r}")
+        if frame == "chart" and (T_camera_base is not None or T_map_world is not None):
+            raise UsageError("frame: expected world with T_camera_base or T_map_world, found chart")
+        pose = self._known_pose()
+        point = self.chart.point(pose.to_array())
+        found = covariance.in_chart(self.conformal_set, point, self.confidence, self.scope)
+        if frame == "chart":
+            return found
+        found = covariance.in_world(found, self.chart, pose, point)
+        base, outer = (None if T is None else as_pose(T) for T in (T_camera_base, T_map_world))
+        if base is None and outer is None:
+            return found
+        lever = np.zeros(3) if base is None else pose.to_matrix()[:3, :3] @ base.t_m
+        R = np.eye(3) if outer is None else outer.to_matrix()[:3, :3]
+        return covariance.moved(found, lever, R)
+
+    def pose_of(
+        self,
+        T_camera_base: Pose | ArrayLike | None = None,
+        T_map_world: Pose | ArrayLike | None = None,
+    ) -> Pose:
+        """Return ``T_map_base``, the pose of the robot's base in the map.
+
+        Parameters as for ``covariance``; raises UsageError for an invalid frame.
+        """
+        found = self._known_pose()
+        if T_camera_base is not None:
+            found = found.then(as_pose(T_camera_base))
+        return found if T_map_world is None else as_pose(T_map_world).then(found)
+
+    def _known_pose(self) -> Pose:
+        if self.pose is None:
+            raise UsageError(f"frame {self.seq} is invalid: it has no pose and no set")
+        return self.pose
 
     def to_record(self, *, region: bool = False) -> Record:
         """Return the record of this frame, with ``interval.region`` on request."""

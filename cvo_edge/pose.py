@@ -58,6 +58,12 @@ class Pose:
         R = geometry.nearest_rotation(T[:3, :3])
         return cls(T[:3, 3].copy(), geometry.matrix_to_quaternion(R))
 
+    def then(self, other: Pose) -> Pose:
+        """Return the pose of what has the pose ``other`` in the frame that this one places."""
+        t = self.t_m + geometry.quaternion_to_matrix(self.q_xyzw) @ other.t_m
+        q = geometry.quaternion_multiply(self.q_xyzw, other.q_xyzw)
+        return Pose(t, geometry.quaternion_normalise(q))
+
     def to_array(self) -> Array:
         """Shape (7,): tx ty tz qx qy qz qw."""
         return np.concatenate([self.t_m, self.q_xyzw])
@@ -68,6 +74,11 @@ class Pose:
         T[:3, :3] = geometry.quaternion_to_matrix(self.q_xyzw)
         T[:3, 3] = self.t_m
         return T
+
+
+def as_pose(given: Pose | ArrayLike) -> Pose:
+    """Return a pose as it is, or seven numbers as a pose; raises UsageError."""
+    return given if isinstance(given, Pose) else Pose.from_array(given)
 
 
 def about(poses: Array, origin_m: Sequence[float] | None) -> Array:

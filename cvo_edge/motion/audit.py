@@ -10,8 +10,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from cvo_edge.covariance import nees
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.motion.covariance import CHI_SQUARE, SPANS_S, nees, sums_of
+from cvo_edge.motion.covariance import CHI_SQUARE, SPANS_S, sums_of
 from cvo_edge.motion.direction import angles, check_same
 from cvo_edge.motion.drift import Running
 from cvo_edge.motion.intervals import (

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import geometry
+from cvo_edge.covariance import nees
 from cvo_edge.motion.relative import motion, residual
 from cvo_edge.motion.thresholds import Scores
 from cvo_edge.motion.trace import Rows
@@ -88,12 +89,6 @@ def in_fixed_axes(covariance: Array, q_xyzw: Array) -> Array:
     B = np.zeros((len(R), 6, 6))
     B[:, :3, :3] = B[:, 3:, 3:] = R
     return np.asarray(B @ covariance @ np.swapaxes(B, 1, 2))
-
-
-def nees(residuals: Array, covariance: Array) -> Array:
-    """Return x^T Sigma^-1 x (n,) of residuals (n, 6)."""
-    solved = np.linalg.solve(covariance, residuals[:, :, np.newaxis])[:, :, 0]
-    return np.asarray(np.sum(residuals * solved, axis=1))
 
 
 def fit_shape(scaled: Spread[Array], groups: Sequence[str]) -> Shape:

@@ -313,6 +313,12 @@ def _level_lines(
         for level in levels
         if level["confidence"] == 0.9 and "joint_volume" in level
     ]
+    lines += [
+        f"{level['confidence']:<8g}{level['scope']:<12}covariance: NEES / 6 {nees['mean']:.2f} "
+        f"(median {nees['median']:.2f}), {nees['inside']:.2f} within the ellipsoid of 0.9"
+        for level in levels
+        if level["confidence"] == 0.9 and (nees := level["nees"])
+    ]
     if not all(level["coverage_band_exact"] for level in levels):
         lines.append(footnote)
     return lines + _proven_lines(levels)

@@ -13,6 +13,7 @@ from scipy.stats import betabinom, spearmanr
 
 from cvo_edge.bundle.format import Calibration, Threshold
 from cvo_edge.conformal import conformal_rank, interval_score
+from cvo_edge.covariance import chi_square_quantile, in_chart, nees
 from cvo_edge.guarantee import statement
 from cvo_edge.odometer import Odometer
 from cvo_edge.sets import ConformalSet
@@ -179,6 +180,7 @@ class Sets:
             "left_out": msgspec.to_builtins(entry.left_out),
             "joint_coverage": self.covered_jointly(sets),
             **self.widths(limited, alpha),
+            "nees": self.nees(sets, entry),
             "unbounded_share": float(1.0 - bounded.mean()),
             **(
                 self.volumes(limited)
@@ -206,6 +208,24 @@ class Sets:
             "median_width": np.median(width, axis=0).tolist(),
             "interval_score": score.tolist(),
             "normalised_interval_score": float((score / self.deviation)[moves].mean()),
+        }
+
+    def nees(self, sets: list[ConformalSet], entry: Threshold) -> dict[str, float] | None:
+        """Return how well the covariances of ``PoseInterval.covariance`` fit the errors.
+
+        ``mean`` and ``median`` of NEES / 6, whose mean is 1 where they fit, and ``inside``, the
+        share of NEES up to the chi-square quantile at 0.9. None if no set is bounded.
+        """
+        pairs = zip(sets, self.seen.point, strict=True)
+        found = np.array([in_chart(s, p, entry.confidence, entry.scope) for s, p in pairs])
+        finite = np.isfinite(found).all(axis=(1, 2))
+        if not finite.any():
+            return None
+        values = nees((self.seen.truth - self.seen.point)[finite], found[finite])
+        return {
+            "mean": float(values.mean() / 6.0),
+            "median": float(np.median(values) / 6.0),
+            "inside": float(np.mean(values <= chi_square_quantile(0.9))),
         }
 
     def adaptiveness(self, sets: list[ConformalSet]) -> dict[str, float | None]:
