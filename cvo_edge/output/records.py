@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from itertools import chain
@@ -9,14 +10,25 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
-from msgspec import Struct
+import numpy as np
+from msgspec import UNSET, Struct, UnsetType
+from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Calibration, Quaternion
 from cvo_edge.errors import SourceError
-from cvo_edge.estimate import Record
-from cvo_edge.pose import Chart, Rotation
+from cvo_edge.estimate import (
+    BandsOrUnbounded,
+    Drift,
+    PoseInterval,
+    Record,
+    RecordedRegion,
+    SixOrUnbounded,
+)
+from cvo_edge.pose import Chart, Pose, Rotation
+from cvo_edge.sets import Bands, ConformalSet, Ellipsoids, unbounded_set
 from cvo_edge.vocabulary import VERSION, Precision, Provider, Scope
 
+Array = NDArray[np.float64]
 Stamps = Literal["fps", "arrival"]
 
 
@@ -91,6 +103,60 @@ def header_of(
         scope=scope,
         stamps=stamps,
     )
+
+
+def estimate_of(record: Record, header: Header) -> PoseInterval:
+    """Return the estimate that a record was written from; its drift has no reason.
+
+    The region is there only if it was recorded.
+    """
+    reference = header.reference_q_xyzw
+    chart = Chart(header.rotation, None if reference is None else np.array(reference))
+    pose, interval = record.pose, record.interval
+    found = unbounded_set()
+    if interval is not None:
+        found = ConformalSet(
+            _bounds(interval.lower, -np.inf),
+            _bounds(interval.upper, np.inf),
+            None if interval.bands is None else _bands(interval.bands),
+            ellipsoids=_ellipsoids(interval.region),
+        )
+    return PoseInterval(
+        record.seq,
+        record.stamp_ns,
+        record.source,
+        record.status,
+        record.reasons,
+        None if pose is None else Pose(np.array(pose.t_m), np.array(pose.q_xyzw)),
+        found,
+        header.confidence,
+        header.scope,
+        chart,
+        record.latency_ms,
+        record.factor or None,
+        Drift("unknown") if record.drift is UNSET else Drift(record.drift),
+        None if record.novelty is UNSET else record.novelty,
+    )
+
+
+def _bounds(values: SixOrUnbounded, unbounded: float) -> Array:
+    return np.array([unbounded if value is None else value for value in values])
+
+
+def _bands(rows: BandsOrUnbounded) -> Bands:
+    return tuple(
+        tuple(
+            (-math.inf if low is None else low, math.inf if high is None else high)
+            for low, high in row
+        )
+        for row in rows
+    )
+
+
+def _ellipsoids(region: RecordedRegion | UnsetType | None) -> Ellipsoids | None:
+    if not region:
+        return None
+    return Ellipsoids(np.array(region.centres), np.array(region.scale), region.radius)
 
 
 class Records:
