@@ -12,7 +12,7 @@ VERSION = "0.1.0"
 
 Scope = Literal["marginal", "joint"]
 Mode = Literal["live", "latency", "throughput"]
-Format = Literal["jsonl", "csv", "tum", "table"]
+Format = Literal["jsonl", "csv", "tum", "table", "mcap"]
 Crop = Literal["none", "centre"]
 Precision = Literal["fp32", "int8"]
 Provider = Literal["onnxruntime", "openvino"]

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.errors import UsageError
 from cvo_edge.estimate import PoseInterval, Status
+from cvo_edge.output.records import Header
 from cvo_edge.pose import Pose
 
 Array = NDArray[np.float64]
@@ -64,6 +65,11 @@ class Placement:
     T_camera_base: Pose | None = None
     T_map_world: Pose | None = None
     unknown_variance: float | None = None
+
+    @classmethod
+    def of(cls, header: Header) -> Placement:
+        """Return the frames of a header: the camera in its world."""
+        return cls(header.frame_id, header.child_frame_id)
 
     def __post_init__(self) -> None:
         """Raise UsageError for a variance that a filter would take for something else."""

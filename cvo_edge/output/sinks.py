@@ -21,15 +21,20 @@ from cvo_edge.vocabulary import Format
 
 Array = NDArray[np.float64]
 
-_SUFFIXES: dict[str, Format] = {".jsonl": "jsonl", ".csv": "csv", ".tum": "tum"}
+_SUFFIXES: dict[str, Format] = {
+    ".jsonl": "jsonl",
+    ".csv": "csv",
+    ".tum": "tum",
+    ".mcap": "mcap",
+}
 _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
 
 
 def format_of(path: str, format: Format | None = None) -> Format:
     """Return an output's format: as requested, or from the suffix of the path, or ``jsonl``.
 
-    Raises UsageError if the suffix (``.jsonl``, ``.csv`` or ``.tum``) contradicts the requested
-    format.
+    Raises UsageError if the suffix (``.jsonl``, ``.csv``, ``.tum``, ``.mcap``) contradicts the
+    requested format.
     """
     of_suffix = _SUFFIXES.get(Path(path).suffix.lower())
     if format and of_suffix and format != of_suffix:

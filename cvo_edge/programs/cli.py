@@ -11,6 +11,14 @@ import typer
 from cvo_edge.errors import GateError, SourceError, UsageError
 from cvo_edge.files import refuse_overwriting, write_text
 from cvo_edge.process import guarded, say
+from cvo_edge.programs.convert import (
+    BaseOption,
+    ChildFrameIdOption,
+    FrameIdOption,
+    MapOption,
+    UnknownVarianceOption,
+    convert,
+)
 from cvo_edge.programs.examine import cache, doctor, inspect, schema, verify
 from cvo_edge.programs.motion import annotate, audit, conformalize
 from cvo_edge.programs.odometry import odometry
@@ -125,6 +133,11 @@ def run(
     threads: ThreadsOption = None,
     cache: CacheOption = True,
     public_key: PublicKeyOption = None,
+    base: BaseOption = None,
+    map: MapOption = None,
+    frame_id: FrameIdOption = None,
+    child_frame_id: ChildFrameIdOption = None,
+    unknown_variance: UnknownVarianceOption = None,
 ) -> None:
     """Estimate a pose interval for every frame of a source."""
     from cvo_edge.camera import read_camera
@@ -132,8 +145,10 @@ def run(
     from cvo_edge.input.capture import shown
     from cvo_edge.input.sources import open_source
     from cvo_edge.odometer import Odometer
+    from cvo_edge.output.opening import open_sink
     from cvo_edge.output.records import header_of
-    from cvo_edge.output.sinks import Sink, format_of
+    from cvo_edge.output.sinks import format_of
+    from cvo_edge.programs.conversion import placement_of
     from cvo_edge.programs.labels import Labels
     from cvo_edge.programs.progress import frames_progress
     from cvo_edge.programs.run import RunSummary
@@ -173,7 +188,8 @@ def run(
             scope,
             stamps="fps" if fps else "arrival" if frames.live else None,
         )
-        with Sink(output, written_as, header, region=region) as sink:
+        placement = placement_of(header, base, map, frame_id, child_frame_id, unknown_variance)
+        with open_sink(output, written_as, header, placement, region=region) as sink:
             try:
                 with frames_progress(watched, summary, frames.length, max_frames) as tick:
                     run_frames(
@@ -295,7 +311,18 @@ def drift(
         raise GateError(f"drift: expected a martingale of at most {max_martingale:g}, {found}")
 
 
-for command in (odometry, conformalize, annotate, audit, verify, inspect, schema, doctor, cache):
+for command in (
+    convert,
+    odometry,
+    conformalize,
+    annotate,
+    audit,
+    verify,
+    inspect,
+    schema,
+    doctor,
+    cache,
+):
     app.command()(command)
 
 

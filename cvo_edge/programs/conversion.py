@@ -1,0 +1,122 @@
+"""Convert records into files of other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.estimate import PoseInterval
+from cvo_edge.output.mcap import McapSink, recover
+from cvo_edge.output.messages import Message, Placement, ros_image
+from cvo_edge.output.opening import open_sink
+from cvo_edge.output.records import Header, estimate_of, read_records
+from cvo_edge.pose import Pose
+from cvo_edge.vocabulary import Format
+
+_ENCODINGS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}
+
+
+def pose_of(option: str, text: str | None) -> Pose | None:
+    """Read ``tx,ty,tz,qx,qy,qz,qw``; raises UsageError."""
+    if text is None:
+        return None
+    try:
+        return Pose.from_array([float(word) for word in text.split(",")])
+    except (ValueError, UsageError):
+        raise UsageError(
+            f"{option}: expected tx,ty,tz,qx,qy,qz,qw in metres and a quaternion, found {text}"
+        ) from None
+
+
+def placement_of(
+    header: Header,
+    base: str | None,
+    map: str | None,
+    frame_id: str | None,
+    child_frame_id: str | None,
+    unknown_variance: float | None,
+) -> Placement | None:
+    """Return what the options say, or None if they say nothing.
+
+    Raises UsageError for a pose that is none, or one that moves a frame but not its name.
+    """
+    if all(each is None for each in (base, map, frame_id, child_frame_id, unknown_variance)):
+        return None
+    for moved, name, option in ((base, child_frame_id, "base"), (map, frame_id, "map")):
+        if moved is not None and name is None:
+            named = "--child-frame-id" if option == "base" else "--frame-id"
+            raise UsageError(f"--{option}: expected {named} with it, the name of that frame")
+    return Placement(
+        frame_id or header.frame_id,
+        child_frame_id or header.child_frame_id,
+        pose_of("--base", base),
+        pose_of("--map", map),
+        unknown_variance,
+    )
+
+
+def convert(
+    source: Path,
+    output: str,
+    format: Format,
+    images: Path | None,
+    base: str | None,
+    map: str | None,
+    frame_id: str | None,
+    child_frame_id: str | None,
+    unknown_variance: float | None,
+) -> int:
+    """Write records to another format; returns their number. Raises CvoError."""
+    records = read_records(source)
+    header = records.header
+    if header is None:
+        raise SourceError(
+            f"{source}: expected records with a header, which says what their numbers mean, found "
+            "none; records of older versions have to be made again"
+        )
+    placement = placement_of(header, base, map, frame_id, child_frame_id, unknown_variance)
+    if images is not None and format != "mcap":
+        raise UsageError(f"--images: expected the format mcap, found {format}")
+    with open_sink(output, format, header, placement) as sink:
+        count = 0
+        for estimate in _estimates(source, header):
+            if images is not None and isinstance(sink, McapSink):
+                place = placement or Placement.of(header)
+                sink.write(estimate, *_image(estimate, images, place))
+            else:
+                sink.write(estimate)
+            count += 1
+    return count
+
+
+def _estimates(source: Path, first: Header) -> Iterator[PoseInterval]:
+    records = read_records(source)
+    for record in records:
+        if records.header != first:
+            raise SourceError(
+                f"{source}: expected records of one run, found a second header; write each run to "
+                "its own file"
+            )
+        yield estimate_of(record, first)
+
+
+def _image(estimate: PoseInterval, images: Path, placement: Placement) -> Iterator[Message]:
+    path = images / estimate.source
+    encoding = _ENCODINGS.get(path.suffix.lower())
+    if encoding is None:
+        raise SourceError(
+            f"{estimate.source or f'frame {estimate.seq}'}: expected the name of a JPEG or PNG "
+            f"file in {images}, as records of a folder have it"
+        )
+    try:
+        yield ros_image(estimate, placement, encoding, path.read_bytes())
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def recovered(source: Path, output: str) -> str:
+    """Finish a file that was not; returns the line that says what was found."""
+    found = recover(source, output)
+    state = "was finished" if found.finished else "was not finished"
+    return f"{source} {state}; {found.messages} complete messages -> {output}"

@@ -1,0 +1,117 @@
+"""The command ``convert``, and the options that say in which frames other programs see a pose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cvo_edge.errors import UsageError
+from cvo_edge.files import refuse_overwriting
+from cvo_edge.process import say
+from cvo_edge.vocabulary import Format
+
+FRAMES = "Frames (mcap)"
+_POSE = "<tx,ty,tz,qx,qy,qz,qw>"
+
+BaseOption = Annotated[
+    str | None,
+    typer.Option(
+        "--base",
+        metavar=_POSE,
+        help="Pose of the robot's base in the camera (x right, y down, z forward): messages give "
+        "the base's pose.",
+        show_default=False,
+        rich_help_panel=FRAMES,
+    ),
+]
+MapOption = Annotated[
+    str | None,
+    typer.Option(
+        "--map",
+        metavar=_POSE,
+        help="Pose of the bundle's world in the map: messages give poses in the map.",
+        show_default=False,
+        rich_help_panel=FRAMES,
+    ),
+]
+FrameIdOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Name of the frame that poses are in; default: the bundle's.",
+        show_default=False,
+        rich_help_panel=FRAMES,
+    ),
+]
+ChildFrameIdOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Name of the frame whose pose is given; default: the bundle's.",
+        show_default=False,
+        rich_help_panel=FRAMES,
+    ),
+]
+UnknownVarianceOption = Annotated[
+    float | None,
+    typer.Option(
+        help="Also give poses without bounds, with this variance (m^2, rad^2; 1 to 1e12). Default: "
+        "no pose.",
+        show_default=False,
+        rich_help_panel=FRAMES,
+    ),
+]
+
+
+def convert(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RECORDS",
+            help="JSON lines of run; with --recover, an MCAP file.",
+            readable=False,
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        str, typer.Option("-o", "--output", help="File to write: .mcap, .csv, .tum or .jsonl.")
+    ],
+    format: Annotated[
+        Format | None,
+        typer.Option(help="Format; default: by the file's suffix.", show_default=False),
+    ] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the frames: add their images (mcap).",
+            readable=False,
+            show_default=False,
+        ),
+    ] = None,
+    recover: Annotated[
+        bool,
+        typer.Option("--recover", help="Finish an MCAP file whose writer was killed."),
+    ] = False,
+    base: BaseOption = None,
+    map: MapOption = None,
+    frame_id: FrameIdOption = None,
+    child_frame_id: ChildFrameIdOption = None,
+    unknown_variance: UnknownVarianceOption = None,
+) -> None:
+    """Write records as a file of another program, such as MCAP with messages of ROS 2."""
+    from cvo_edge.output.sinks import format_of
+    from cvo_edge.programs import conversion
+
+    refuse_overwriting(output, source)
+    written_as = format_of(output, format)
+    frames = (base, map, frame_id, child_frame_id, unknown_variance)
+    if recover:
+        if written_as != "mcap" or images is not None or any(each is not None for each in frames):
+            raise UsageError(
+                "--recover: expected RECORDS.mcap and -o FILE.mcap without other options"
+            )
+        say(conversion.recovered(source, output))
+        return
+    count = conversion.convert(source, output, written_as, images, *frames)
+    if output != "-":
+        say(f"{count} records -> {output}")
