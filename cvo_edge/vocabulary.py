@@ -12,6 +12,7 @@ VERSION = "0.1.0"
 
 Scope = Literal["marginal", "joint"]
 Mode = Literal["live", "latency", "throughput"]
+Existing = Literal["replace", "append", "force"]
 Format = Literal["jsonl", "csv", "tum", "table", "mcap"]
 Crop = Literal["none", "centre"]
 Precision = Literal["fp32", "int8"]

@@ -7,37 +7,88 @@ import os
 import select
 import stat
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from cvo_edge.errors import SinkError
+from cvo_edge.errors import SinkError, UsageError
+from cvo_edge.vocabulary import Existing
+
+# Set by SIGHUP: every file is opened again before its next line.
+_reopening = 0
+# A file of this program says so in its beginning.
+# Files of older versions, and tables, say it in other words.
+_BEGINNING, _MARK = 4096, b"cvo-edge"
+_OTHER_BEGINNINGS = (b'{"seq":', b"seq,stamp_ns,", b"Position and half the width")
+
+
+def reopen_files() -> None:
+    """Have every ``LineFile`` open its name again before its next line.
+
+    A log that was renamed (logrotate) is then followed by a new file.
+    """
+    global _reopening
+    _reopening += 1
+
+
+def refuse_foreign(path: str) -> None:
+    """Raise UsageError if a file exists that this program did not write, and is not empty."""
+    try:
+        with Path(path).open("rb", buffering=0) as stream:
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+                return
+            beginning = stream.read(_BEGINNING)
+    except OSError:
+        # None there, or one that opening it for writing judges.
+        return
+    if beginning and _MARK not in beginning and not beginning.startswith(_OTHER_BEGINNINGS):
+        raise UsageError(
+            f"{path}: expected a new file or one of cvo-edge, found another one; choose another "
+            "name, or --force to replace it"
+        )
 
 
 class LineFile:
     """Writes whole lines, so that written ones survive a crash.
 
+    Lines are appended: a file that another program truncates (copytruncate) goes on at its new end.
+
     Parameters
     ----------
     path
-        Output file, truncated when the first line is written, or ``-`` for standard output.
+        Output file, or ``-`` for standard output.
+    existing
+        What happens to a file that exists. ``replace``: it is truncated when the first line is
+        written, if it is one of this program; ``force``: any is; ``append``: it is kept but for an
+        incomplete last line.
+    told
+        Called once if the file loses its name.
 
     Raises
     ------
     SinkError
         The file cannot be opened or, later, written. Complete lines are kept; an incomplete line is
         removed from a regular file.
+    UsageError
+        The file exists, and is none of this program.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(
+        self,
+        path: str,
+        existing: Existing = "replace",
+        told: Callable[[str], None] | None = None,
+    ) -> None:
         self._owned = path != "-"
         self._name = path if self._owned else "standard output"
+        self._existing, self._told = existing, told
         self._started = False
+        self._opened = _reopening
+        if self._owned and existing != "force":
+            refuse_foreign(path)
         try:
-            self._descriptor = (
-                os.open(path, os.O_WRONLY | os.O_CREAT, 0o666)
-                if self._owned
-                else sys.stdout.fileno()
-            )
+            self._descriptor = _opened(path) if self._owned else sys.stdout.fileno()
             self._alone()
         except OSError as error:
             raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
@@ -83,8 +134,9 @@ class LineFile:
         if not self._started:
             self._started = True
             # Keep the old contents until the first new line is ready.
-            if self._owned and stat.S_ISREG(os.fstat(self._descriptor).st_mode):
-                os.ftruncate(self._descriptor, 0)
+            self._make_room()
+        elif self._owned:
+            self._follow_name()
         written = 0
         while written < len(line):
             try:
@@ -100,6 +152,44 @@ class LineFile:
                 self._take_back(written - (line[:written].rfind(b"\n") + 1))
                 raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
 
+    def _make_room(self) -> None:
+        """Truncate a file that is replaced, or remove the incomplete last line of one that is not.
+
+        A second writer is locked out.
+        """
+        if not self._owned or not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
+            return
+        end = 0
+        if self._existing == "append":
+            end = _end_of_lines(self._name)
+        os.ftruncate(self._descriptor, end)
+
+    def _follow_name(self) -> None:
+        """Open the file again if told to; tell once if its name is gone or another file's."""
+        if self._opened != _reopening:
+            self._opened = _reopening
+            try:
+                descriptor = _opened(self._name)
+            except OSError as error:
+                raise SinkError(f"{self._name}: cannot be opened again: {error.strerror}") from None
+            os.close(self._descriptor)
+            self._descriptor = descriptor
+            self._alone()
+        elif self._told is not None and not self._has_name():
+            self._told(
+                f"{self._name}: was renamed or removed; records still go to that file. SIGHUP "
+                "opens a new one"
+            )
+            self._told = None
+
+    def _has_name(self) -> bool:
+        try:
+            named = os.stat(self._name)  # noqa: PTH116 - before every line
+        except OSError:
+            return False
+        found = os.fstat(self._descriptor)
+        return (named.st_dev, named.st_ino) == (found.st_dev, found.st_ino)
+
     def _take_back(self, written: int) -> None:
         """Remove an incomplete line from a regular file."""
         found = os.fstat(self._descriptor)
@@ -110,3 +200,21 @@ class LineFile:
         if end == found.st_size:
             os.ftruncate(self._descriptor, end - written)
             os.lseek(self._descriptor, end - written, os.SEEK_SET)
+
+
+def _opened(path: str) -> int:
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+
+
+def _end_of_lines(path: str) -> int:
+    """Return where the last complete line of a file ends."""
+    with Path(path).open("rb") as stream:
+        end = stream.seek(0, os.SEEK_END)
+        while end > 0:
+            begin = max(0, end - _BEGINNING)
+            stream.seek(begin)
+            found = stream.read(end - begin).rfind(b"\n")
+            if found >= 0:
+                return begin + found + 1
+            end = begin
+    return 0

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Protocol
 
 from cvo_edge.errors import UsageError
 from cvo_edge.estimate import PoseInterval
+from cvo_edge.output.lines import refuse_foreign
 from cvo_edge.output.messages import Placement
 from cvo_edge.output.records import Header
 from cvo_edge.output.sinks import Sink
-from cvo_edge.vocabulary import Format
+from cvo_edge.vocabulary import Existing, Format
 
 
 class Writing(Protocol):
@@ -27,10 +29,13 @@ def open_sink(
     placement: Placement | None = None,
     *,
     region: bool = False,
+    existing: Existing = "replace",
+    told: Callable[[str], None] | None = None,
 ) -> AbstractContextManager[Writing]:
     """Return the sink for a format.
 
-    ``placement`` is for formats of other programs; None: the frames of the header.
+    ``placement`` is for formats of other programs; None: the frames of the header. ``existing`` and
+    ``told`` are those of ``LineFile``; a file of messages is never appended to.
 
     Raises UsageError for a placement or a region that the format does not have, and SinkError.
     """
@@ -40,10 +45,12 @@ def open_sink(
 
         if region:
             raise UsageError("region: expected the format jsonl, found mcap")
+        if existing == "replace":
+            refuse_foreign(path)
         return McapSink(path, header, placement or Placement.of(header))
     if placement is not None:
         raise UsageError(
             f"frames: expected the format mcap with --base, --map, frame names or "
             f"--unknown-variance, found {format}"
         )
-    return Sink(path, format, header, region=region)
+    return Sink(path, format, header, region=region, existing=existing, told=told)

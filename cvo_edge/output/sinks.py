@@ -17,7 +17,7 @@ from cvo_edge.estimate import BandsOrUnbounded, PoseInterval
 from cvo_edge.output.lines import LineFile
 from cvo_edge.output.records import Header
 from cvo_edge.output.table import table_heading, table_line
-from cvo_edge.vocabulary import Format
+from cvo_edge.vocabulary import Existing, Format
 
 Array = NDArray[np.float64]
 
@@ -59,6 +59,8 @@ class Sink:
         ``tum``. None if the file holds records of several bundles.
     region
         Include the points of the region, if there is one, in the records; ``jsonl`` only.
+    existing, told
+        As for ``LineFile``.
 
     Raises
     ------
@@ -69,7 +71,14 @@ class Sink:
     """
 
     def __init__(
-        self, path: str, format: Format, header: Header | None = None, *, region: bool = False
+        self,
+        path: str,
+        format: Format,
+        header: Header | None = None,
+        *,
+        region: bool = False,
+        existing: Existing = "replace",
+        told: Callable[[str], None] | None = None,
     ) -> None:
         if region and format != "jsonl":
             raise UsageError(f"region: expected the format jsonl, found {format}")
@@ -77,7 +86,7 @@ class Sink:
         self._heading, self._line = _FORMATS[format]
         if region:
             self._line = _json_line_with_region
-        self._lines = LineFile(path)
+        self._lines = LineFile(path, existing, told)
 
     def __enter__(self) -> Sink:
         """Return itself."""

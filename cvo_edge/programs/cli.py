@@ -25,10 +25,12 @@ from cvo_edge.programs.odometry import odometry
 from cvo_edge.programs.options import (
     INTERVALS,
     REPORT,
+    AppendOption,
     BundleArgument,
     CacheOption,
     CameraOption,
     ExpectMotionOption,
+    ForceOption,
     FormatOption,
     GroundTruthOption,
     JsonFileOption,
@@ -45,6 +47,7 @@ from cvo_edge.programs.options import (
     ThreadsOption,
     TimeoutOption,
     examples,
+    existing_file,
 )
 from cvo_edge.vocabulary import Mode, Scope
 
@@ -100,6 +103,8 @@ def run(
     ],
     output: OutputOption = "-",
     format: FormatOption = None,
+    append: AppendOption = False,
+    force: ForceOption = False,
     region: RegionOption = False,
     ground_truth: GroundTruthOption = None,
     quiet: Annotated[
@@ -157,6 +162,7 @@ def run(
     if label_delay and labels is None:
         raise UsageError("--label-delay: expected --labels FILE with it, found no labels")
     written_as = format_of(output, format)
+    existing = existing_file(append, force, written_as)
     read = (source, bundle, public_key, camera, state, stamps)
     refuse_overwriting(output, *read, *named_files(ground_truth), *named_files(labels))
     truth = None if ground_truth is None else open_ground_truth(ground_truth, source)
@@ -189,7 +195,9 @@ def run(
             stamps="fps" if fps else "arrival" if frames.live else None,
         )
         placement = placement_of(header, base, map, frame_id, child_frame_id, unknown_variance)
-        with open_sink(output, written_as, header, placement, region=region) as sink:
+        with open_sink(
+            output, written_as, header, placement, region=region, existing=existing, told=say
+        ) as sink:
             try:
                 with frames_progress(watched, summary, frames.length, max_frames) as tick:
                     run_frames(

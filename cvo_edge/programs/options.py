@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cvo_edge.vocabulary import Format, Mode
+from cvo_edge.errors import UsageError
+from cvo_edge.vocabulary import Existing, Format, Mode
 
 INTERVALS, RUNTIME, REPORT = "Intervals", "Runtime", "Output"
 ADAPTATION = "Adaptation"
@@ -20,6 +21,15 @@ MOST_DELAY = 1023
 def examples(*commands: str) -> str:
     """Return the epilog that lists commands, one per line."""
     return "\n\n".join(["Examples:", *commands])
+
+
+def existing_file(append: bool, force: bool, format: str) -> Existing:
+    """Return what happens to an output that exists; raises UsageError for a contradiction."""
+    if append and force:
+        raise UsageError("--append: expected it without --force, found both")
+    if append and format in ("csv", "mcap", "table"):
+        raise UsageError(f"--append: expected the format jsonl or tum, found {format}")
+    return "append" if append else "force" if force else "replace"
 
 
 # readable: a file that cannot be read has an exit code of ours.
@@ -89,6 +99,22 @@ FormatOption = Annotated[
         help="Format of the records; default: by the file's suffix (.jsonl, .csv, .tum), else "
         "jsonl.",
         show_default=False,
+        rich_help_panel=REPORT,
+    ),
+]
+AppendOption = Annotated[
+    bool,
+    typer.Option(
+        "--append",
+        help="Keep the records of an existing file, and add to them.",
+        rich_help_panel=REPORT,
+    ),
+]
+ForceOption = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="Replace an existing file that cvo-edge did not write.",
         rich_help_panel=REPORT,
     ),
 ]

@@ -24,6 +24,7 @@ from cvo_edge import (
     open_source,
 )
 from cvo_edge.ground_truth import open_ground_truth
+from cvo_edge.output.lines import LineFile, reopen_files
 from cvo_edge.output.records import header_of
 from cvo_edge.output.sinks import Sink, format_of
 from cvo_edge.pose import Chart
@@ -242,11 +243,11 @@ def test_a_suffix_that_contradicts_the_format_is_refused(name, format):
 
 def test_an_old_file_is_kept_until_there_is_a_line_to_put_in_its_place(tmp_path, estimates):
     path = tmp_path / "a.txt"
-    path.write_text("precious\n" * 9)
+    path.write_text("# software: cvo-edge\n" * 9)
     unstamped = dataclasses.replace(estimates[0], stamp_ns=None)
     with Sink(str(path), "tum") as sink, pytest.raises(UsageError):
         sink.write(unstamped)
-    assert path.read_text() == "precious\n" * 9
+    assert path.read_text() == "# software: cvo-edge\n" * 9
     assert len(write(path, "jsonl", estimates).splitlines()) == len(estimates)
 
 
@@ -308,3 +309,45 @@ def test_one_file_has_one_writer(tmp_path, estimates):
         sink.write(estimates[1])
     assert len(path.read_text().splitlines()) == 2
     assert len(write(path, "jsonl", estimates).splitlines()) == len(estimates)
+
+
+def test_a_file_of_another_program_is_replaced_only_by_force(tmp_path):
+    path = tmp_path / "thesis.txt"
+    path.write_text("precious\n")
+    with pytest.raises(UsageError, match="--force to replace it"):
+        LineFile(str(path))
+    assert path.read_text() == "precious\n"
+    with LineFile(str(path), "force") as lines:
+        lines.write(b"line\n")
+    assert path.read_text() == "line\n"
+
+
+def test_appending_removes_an_incomplete_line_alone(tmp_path):
+    path = tmp_path / "a.jsonl"
+    path.write_bytes(b'{"seq":0}\n{"seq":1')
+    with LineFile(str(path), "append") as lines:
+        lines.write(b'{"seq":2}\n')
+    assert path.read_bytes() == b'{"seq":0}\n{"seq":2}\n'
+
+
+def test_a_file_that_is_truncated_meanwhile_goes_on_at_its_end(tmp_path):
+    path = tmp_path / "a.jsonl"
+    with LineFile(str(path)) as lines:
+        lines.write(b"first\n")
+        os.truncate(path, 0)
+        lines.write(b"second\n")
+    assert path.read_bytes() == b"second\n"
+
+
+def test_a_renamed_file_is_told_once_and_reopened_when_asked(tmp_path):
+    path, told = tmp_path / "a.jsonl", []
+    with LineFile(str(path), told=told.append) as lines:
+        lines.write(b"first\n")
+        path.rename(tmp_path / "a.jsonl.1")
+        lines.write(b"second\n")
+        lines.write(b"third\n")
+        reopen_files()
+        lines.write(b"fourth\n")
+    assert [line.split(": ")[1][:11] for line in told] == ["was renamed"]
+    assert (tmp_path / "a.jsonl.1").read_bytes() == b"first\nsecond\nthird\n"
+    assert path.read_bytes() == b"fourth\n"
