@@ -128,12 +128,17 @@ def nees(errors: Array, covariances: Array) -> Array:
     return np.asarray(np.sum(errors * solved, axis=1))
 
 
+def euler_axes(turn: Array) -> Array:
+    """Return [Rz Ry ex, Rz ey, ez] (3, 3): what roll, pitch and yaw (3,) turn about."""
+    _, pitch, yaw = turn.tolist()
+    cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
+    return np.array([[cy * cp, -sy, 0.0], [sy * cp, cy, 0.0], [-sp, 0.0, 1.0]])
+
+
 def _rotation_axes(chart: Chart, pose: Pose, turn: Array) -> Array:
     """Return A (3, 3): what the rotation numbers turn about, in the world's axes."""
     if chart.rotation == "euler_zyx":
-        _, pitch, yaw = turn.tolist()
-        cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
-        return np.array([[cy * cp, -sy, 0.0], [sy * cp, cy, 0.0], [-sp, 0.0, 1.0]])
+        return euler_axes(turn)
     R = geometry.quaternion_to_matrix(pose.q_xyzw)
     if chart.rotation == "tangent_predicted":
         return R
