@@ -39,17 +39,14 @@ def placement_of(
 ) -> Placement | None:
     """Return what the options say, or None if they say nothing.
 
-    Raises UsageError for a pose that is none, or one that moves a frame but not its name.
+    Raises UsageError for a pose that is none.
     """
     if all(each is None for each in (base, map, frame_id, child_frame_id, unknown_variance)):
         return None
-    for moved, name, option in ((base, child_frame_id, "base"), (map, frame_id, "map")):
-        if moved is not None and name is None:
-            named = "--child-frame-id" if option == "base" else "--frame-id"
-            raise UsageError(f"--{option}: expected {named} with it, the name of that frame")
+    # A frame that is moved is no longer the bundle's: REP 105 has names for it.
     return Placement(
-        frame_id or header.frame_id,
-        child_frame_id or header.child_frame_id,
+        frame_id or (header.frame_id if map is None else "map"),
+        child_frame_id or (header.child_frame_id if base is None else "base_link"),
         pose_of("--base", base),
         pose_of("--map", map),
         unknown_variance,

@@ -39,7 +39,7 @@ MapOption = Annotated[
 FrameIdOption = Annotated[
     str | None,
     typer.Option(
-        help="Name of the frame that poses are in; default: the bundle's.",
+        help="Name of the frame that poses are in; default: the bundle's, or map with --map.",
         show_default=False,
         rich_help_panel=FRAMES,
     ),
@@ -47,7 +47,8 @@ FrameIdOption = Annotated[
 ChildFrameIdOption = Annotated[
     str | None,
     typer.Option(
-        help="Name of the frame whose pose is given; default: the bundle's.",
+        help="Name of the frame whose pose is given; default: the bundle's, or base_link with "
+        "--base.",
         show_default=False,
         rich_help_panel=FRAMES,
     ),
