@@ -17,7 +17,7 @@ from packaging.version import Version
 FOLDER = Path(__file__).resolve().parent
 ROOTS = {
     "runtime.txt": (
-        "cvo-edge[openvino,plot,ray,rosbag,sign]",
+        "cvo-edge[mavlink,mcap,metrics,openvino,plot,ray,rosbag,sign]",
         "pip install -c constraints/runtime.txt .",
     ),
     "export.txt": (

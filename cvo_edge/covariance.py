@@ -63,7 +63,7 @@ def in_chart(found: ConformalSet, point: Array, confidence: float, scope: Scope)
     variance = ((found.upper - found.lower) / (2.0 * z)) ** 2
     known = np.isfinite(variance)
     off = np.zeros(_SIX)
-    off[known] = 0.5 * (found.lower + found.upper)[known] - point[known]
+    off[known] = 0.5 * (found.lower[known] + found.upper[known]) - point[known]
     return np.asarray(np.diag(variance) + np.outer(off, off))
 
 

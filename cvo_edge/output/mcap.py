@@ -194,7 +194,7 @@ class McapSink:
     Parameters
     ----------
     path
-        The file; replaced.
+        The file; replaced when the first frame is written.
     header
         What all records share; it becomes the file's metadata ``cvo-edge``.
     placement
@@ -204,10 +204,9 @@ class McapSink:
     def __init__(self, path: str, header: Header, placement: Placement) -> None:
         if path == "-":
             raise UsageError("mcap: expected a file, found standard output")
-        self._header, self._placement = header, placement
-        self._file = McapFile(path)
-        self._file.metadata("cvo-edge", _flat(header))
-        self._file.flush()
+        _libraries()
+        self._path, self._header, self._placement = path, header, placement
+        self._file: McapFile | None = None
 
     def __enter__(self) -> McapSink:
         """Return itself."""
@@ -220,7 +219,8 @@ class McapSink:
         traceback: TracebackType | None,
     ) -> None:
         """Finish the file."""
-        self._file.__exit__(kind, error, traceback)
+        if self._file is not None:
+            self._file.__exit__(kind, error, traceback)
 
     def write(self, estimate: PoseInterval, *more: Message) -> None:
         """Write the messages of a frame, and ``more`` of the same time.
@@ -229,6 +229,10 @@ class McapSink:
         """
         messages = [*ros_messages(estimate, self._placement, self._header.bundle), *more]
         stamp_ns = estimate.stamp_ns or 0
+        if self._file is None:
+            # An old file is kept until there is a frame to put in its place.
+            self._file = McapFile(self._path)
+            self._file.metadata("cvo-edge", _flat(self._header))
         for message in messages:
             self._file.write(message, stamp_ns, estimate.seq)
         self._file.flush()

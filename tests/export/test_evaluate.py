@@ -122,7 +122,8 @@ def test_coverage_gate(report):
 
 def test_table_shows_every_level(report):
     text = "\n".join(table(report))
-    assert text.count("marginal  ") == 5
+    # Five levels, and what the covariance at one of them is worth.
+    assert text.count("marginal  ") == 6
     assert text.count("joint  ") >= 5
     assert text.count("of frames exchangeable with the calibration frames, ") == 4
     assert "at 0.99 marginal and joint: unbounded; finite from 99 calibration frames, has" in text

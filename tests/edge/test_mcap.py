@@ -1,0 +1,128 @@
+"""MCAP files are read by independent readers, and survive what kills their writer."""
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.estimate import Status
+from cvo_edge.output.messages import Placement, ros_image
+from cvo_edge.pose import Pose
+
+from .test_messages import HEADER, frame
+
+pytest.importorskip("mcap.writer")
+read_ros2 = pytest.importorskip("mcap_ros2.reader").read_ros2_messages
+AnyReader = pytest.importorskip("rosbags.highlevel").AnyReader
+
+from cvo_edge.output.mcap import McapSink, recover  # noqa: E402 - after the libraries are known
+
+TURNED = Pose(np.array([5.0, 0.0, 1.0]), np.array([0.0, 0.0, np.sin(0.4), np.cos(0.4)]))
+PLACE = Placement("map", "base_link", T_map_world=TURNED)
+FRAMES = [frame(seq=0), frame(Status.DEGRADED, seq=1), frame(Status.INVALID, seq=2), frame(seq=3)]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mcap") / "a.mcap"
+    with McapSink(str(path), HEADER, PLACE) as sink:
+        for each in FRAMES:
+            sink.write(each, ros_image(each, PLACE, "jpeg", b"image %d" % each.seq))
+    return path
+
+
+def of_topic(path, topic):
+    return [each.ros_msg for each in read_ros2(str(path)) if each.channel.topic == topic]
+
+
+def test_an_independent_decoder_reads_the_same_numbers(written):
+    poses = of_topic(written, "/cvo/pose")
+    assert len(poses) == 2
+    for got, wanted in zip(poses, (FRAMES[0], FRAMES[3]), strict=True):
+        stamp = got.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == wanted.stamp_ns
+        assert got.header.frame_id == "map"
+        pose = wanted.pose_of(T_map_world=TURNED)
+        position, turn = got.pose.pose.position, got.pose.pose.orientation
+        found = [position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w]
+        assert found == pose.to_array().tolist()
+        covariance = wanted.covariance(T_map_world=TURNED)
+        assert got.pose.covariance == covariance.ravel().tolist()
+    assert [each.data for each in of_topic(written, "/cvo/image")] == [
+        b"image %d" % seq for seq in range(4)
+    ]
+    levels = [each.status[0].level for each in of_topic(written, "/diagnostics")]
+    assert [int.from_bytes(each) if isinstance(each, bytes) else each for each in levels] == [
+        *(0, 1, 2, 0)
+    ]
+    (transform,) = of_topic(written, "/tf")[0].transforms
+    assert transform.child_frame_id == "base_link"
+
+
+def test_a_strict_reader_takes_every_message(written):
+    with AnyReader([written]) as reader:
+        found = [
+            reader.deserialize(raw, connection.msgtype) for connection, _, raw in reader.messages()
+        ]
+    # Diagnostics, boxes and images of four frames; pose, pose alone and transform of two.
+    assert len(found) == 4 * 3 + 2 * 3
+
+
+def record_ends(content):
+    """Return where each record of an MCAP file ends."""
+    ends = [8]
+    while ends[-1] + 9 <= len(content) - 8:
+        (length,) = struct.unpack_from("<Q", content, ends[-1] + 1)
+        ends.append(ends[-1] + 9 + length)
+    return ends
+
+
+def test_whatever_was_flushed_is_recovered_at_any_cut(written, tmp_path):
+    content = written.read_bytes()
+    ends = record_ends(content)
+    kinds = [content[begin] for begin in ends[:-1]]
+    torn, whole = tmp_path / "torn.mcap", str(tmp_path / "whole.mcap")
+    cuts = {end + more for end in ends for more in (-1, 0, 1)} | {8, 9, 20}
+    for cut in sorted(cut for cut in cuts if 8 <= cut <= len(content)):
+        torn.write_bytes(content[:cut])
+        found = recover(torn, whole)
+        complete = sum(kind == 5 for kind, end in zip(kinds, ends[1:], strict=True) if end <= cut)
+        assert found.messages == complete
+        assert found.finished == (cut == len(content))
+        assert len(list(read_ros2(whole))) == complete
+    with AnyReader([Path(whole)]) as reader:
+        assert len(list(reader.messages())) == 18
+
+
+def test_a_frame_is_in_the_file_when_it_is_written(tmp_path):
+    path = tmp_path / "live.mcap"
+    with McapSink(str(path), HEADER, PLACE) as sink:
+        sizes = []
+        for each in FRAMES:
+            sink.write(each)
+            sizes.append(path.stat().st_size)
+            copy = tmp_path / "copy.mcap"
+            copy.write_bytes(path.read_bytes())
+            assert recover(copy, str(tmp_path / "whole.mcap")).messages >= 2 * len(sizes)
+    assert sizes == sorted(set(sizes))
+
+
+def test_an_old_file_is_kept_until_there_is_a_frame(tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"old")
+    unstamped = replace(FRAMES[0], stamp_ns=None)
+    with McapSink(str(path), HEADER, PLACE) as sink, pytest.raises(UsageError):
+        sink.write(unstamped)
+    assert path.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP", b"no MCAP file at all"])
+def test_another_file_is_not_recovered(tmp_path, content):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    with pytest.raises(SourceError, match="expected an MCAP file"):
+        recover(path, str(tmp_path / "b.mcap"))
+    assert not (tmp_path / "b.mcap").exists()
