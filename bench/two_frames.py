@@ -315,7 +315,7 @@ def main() -> None:
     }
     for name in ("two_frames", "front_end"):
         print(name, report[name])
-    write_result(RESULTS / "odometry" / f"two-frames-{data.name}-{given.network}.json", report)
+    write_result(RESULTS / "two_frames" / f"{data.name}-{given.network}.json", report)
 
 
 if __name__ == "__main__":
