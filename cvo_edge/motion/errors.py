@@ -26,7 +26,8 @@ class Errors(NamedTuple):
     numbers, sizes
         Shape (m, 24) and (m, k): see ``trace.motion_numbers`` and ``trace.scale_numbers``.
     residuals
-        Shape (m, 6): see ``relative.residual``; NaN where the truth is not known.
+        Shape (m, 6): see ``relative.residual``; the first three are of ``translation``, if
+        ``errors_of`` was given it, and NaN where that knows no direction.
     """
 
     end: Integers

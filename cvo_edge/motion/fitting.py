@@ -45,10 +45,6 @@ class Normal(NamedTuple):
         """Return the sums over both."""
         return Normal(self.left + other.left, self.right + other.right)
 
-    def less(self, other: Normal) -> Normal:
-        """Return the sums without those of some of the recordings."""
-        return Normal(self.left - other.left, self.right - other.right)
-
 
 class Scale(NamedTuple):
     """Coefficients U (k, 8), and the range (k - 1,) that numbers are clipped to."""
