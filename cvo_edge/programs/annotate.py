@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -11,7 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.errors import SourceError, UsageError, printable
+from cvo_edge.estimate import Status
 from cvo_edge.motion.annotation import annotate
 from cvo_edge.motion.direction import check_same
 from cvo_edge.motion.files import Poses, says_unscaled, tum_names
@@ -31,6 +33,8 @@ from cvo_edge.vocabulary import MotionCovariance, MotionFormat
 # Records of a file are written in pieces; those of a stream, each at once.
 _AT_ONCE = 256
 _SHOWN = 80
+# Of fewer poses, most may have come before any horizon is reached.
+_MANY = 20
 
 
 def annotate_file(
@@ -47,15 +51,43 @@ def annotate_file(
     ``anchors``: a file with a time a line, in seconds.
     """
     check_same(str(poses.path), poses.unscaled, calibration.pointed)
-    known: list[int] = []
-    if anchors is not None:
-        known = [row.seconds() for row in read_rows(anchors, "time")]
+    known = [] if anchors is None else _anchors(anchors, poses)
     records = annotate(
         calibration, level, poses.stamps_ns, poses.poses, poses.columns, known, covariance
     )
-    _write(calibration, level, records, output, written_as, _AT_ONCE)
+    unbounded: Counter[str] = Counter()
+    counted = _counted(records, unbounded)
+    _write(calibration, level, counted, output, written_as, _AT_ONCE)
+    if 2 * (lost := unbounded.total()) > len(poses.poses) >= _MANY:
+        ((reason, count),) = unbounded.most_common(1)
+        say(
+            f"{poses.path}: no interval at {lost} of {len(poses.poses)} poses ({reason} at "
+            f"{count}); the calibration is of {printable(calibration.file.name)}: check estimator, "
+            "vehicle, rate and unit"
+        )
     if poses.skipped != NONE_SKIPPED:
         say(f"{poses.path}: {poses.skipped}")
+
+
+def _anchors(path: Path, poses: Poses) -> list[int]:
+    """Return the stamps of a list of times; raises SourceError for one that is not of a pose."""
+    stamps_ns = set(poses.stamps_ns.tolist())
+    rows = read_rows(path, "time")
+    for row in rows:
+        if row.seconds() not in stamps_ns:
+            raise SourceError(
+                f"{path}: expected stamps of poses of {poses.path}, found {row.fields[0][:_SHOWN]} "
+                f"in line {row.number}"
+            )
+    return [row.seconds() for row in rows]
+
+
+def _counted(records: Iterable[MotionRecord], unbounded: Counter[str]) -> Iterator[MotionRecord]:
+    """Yield records; count the first reason of those without any interval."""
+    for record in records:
+        if record.status is not Status.OK:
+            unbounded[record.reasons[0] if record.reasons else "no motion fits a horizon"] += 1
+        yield record
 
 
 def annotate_stream(

@@ -135,7 +135,10 @@ def _worth(fits: Sequence[Fit], correction: MotionCorrection, made: bool) -> Ite
     )
     scales = [fit.alignment.scale for fit in fits]
     if correction == "scale" and max(scales) > MOST_SPREAD * min(scales):
-        yield "  not corrected: scales differ too much from each other for one number"
+        yield (
+            "  not corrected: scales differ too much from each other for one number; an estimator "
+            "of one camera has none: give it steps of length 1, after # scale: none"
+        )
     elif made:
         yield "  corrected, as asked"
     else:

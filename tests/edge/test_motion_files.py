@@ -589,6 +589,7 @@ def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -
     large = np.loadtxt(one[0])
     large[:, 1:4] *= 1000.0
     np.savetxt(tmp_path / "mm.tum", large, fmt="%.9f")
+    (tmp_path / "at.txt").write_text("# s\n5.001\n")
     (tmp_path / "no.txt").write_text("# nothing yet\n")
     (tmp_path / "corrupt.json").write_bytes(motion.read_bytes()[:-40])
     output = ["-o", tmp_path / "out.json"]
@@ -617,6 +618,11 @@ def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -
         (["annotate", one[0], motion, "--confidence", "0.7"], 2, "confidence: expected"),
         (["annotate", tmp_path / "none.tum", motion], 6, "none.tum"),
         (["annotate", one[0], motion, "--fps", "10"], 2, "--fps: expected poses without times"),
+        (
+            ["annotate", one[0], motion, "--anchors", tmp_path / "at.txt"],
+            6,
+            "found 5.001 in line 2",
+        ),
         (["annotate", "-", motion, "--fps", "10"], 2, "--fps: expected poses without times"),
         (["audit", *one, motion, "--times", one[0]], 2, "--times: expected poses without times"),
         (["audit", *one, motion, "--times", one[0], "--fps", "9"], 2, "expected one of them"),
@@ -625,3 +631,5 @@ def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -
         found, text = run(*words)
         assert (found, message in text) == (code, True), (words, text)
     assert not (tmp_path / "out.json").exists()
+    code, text = run("annotate", tmp_path / "mm.tum", motion, "-o", tmp_path / "mm.jsonl")
+    assert (code, "mm.tum: no interval at" in text) == (0, True)
