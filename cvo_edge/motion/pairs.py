@@ -77,7 +77,7 @@ class Pair:
 def pair_of(name: str, group: str, estimate: Poses, truth: Poses) -> Pair:
     """Return an estimate and a truth as a pair.
 
-    Raises SourceError if they do not overlap, or hardly.
+    Raises SourceError if they do not overlap, or hardly, and for one file twice.
     """
     period_s = (
         1e-9 * float(np.median(np.diff(truth.stamps_ns))) if len(truth.stamps_ns) > 1 else 0.0
@@ -86,6 +86,11 @@ def pair_of(name: str, group: str, estimate: Poses, truth: Poses) -> Pair:
         raise SourceError(
             f"{truth.path}: expected a truth with at least {1.0 / _SLOWEST_S:g} poses a second, "
             f"found one every {period_s:.3g} s; between its poses a path would be cut short"
+        )
+    if np.array_equal(estimate.poses, truth.poses, equal_nan=True):
+        raise SourceError(
+            f"{estimate.path}: expected an estimate with its truth, found the same poses in "
+            f"{truth.path}"
         )
     track = Track(truth.stamps_ns, truth.poses)
     timed = estimate.timed or truth.timed

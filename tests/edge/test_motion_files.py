@@ -586,6 +586,9 @@ def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -
     apart = np.loadtxt(one[1])
     apart[:, 0] += 1000.0
     np.savetxt(tmp_path / "apart.tum", apart, fmt="%.9f")
+    moved = np.loadtxt(one[1])
+    moved[:, 1] += 7.0
+    np.savetxt(tmp_path / "moved.tum", moved, fmt="%.9f")
     large = np.loadtxt(one[0])
     large[:, 1:4] *= 1000.0
     np.savetxt(tmp_path / "mm.tum", large, fmt="%.9f")
@@ -608,7 +611,9 @@ def test_bad_input_is_one_line_with_its_code(tmp_path: Path, file: MotionFile) -
         (["conformalize", *one, *other, *output, "--name", ""], 2, "--name: expected"),
         (["conformalize", *one, *other, *output, "--scale", "auto,x"], 2, "--scale: expected"),
         (["conformalize", one[0], other[1], *other, *output], 6, "that do not fit"),
-        (["conformalize", one[1], one[1], *other, *output], 6, "the same motions in both"),
+        (["conformalize", one[1], one[1], *other, *output], 6, "the same poses in"),
+        (["conformalize", one[1], tmp_path / "moved.tum", *other, *output], 6, "the same motions"),
+        (["audit", one[1], one[1], motion], 6, "the same poses in"),
         (["audit", *one, motion, "--picture", "a.jpg"], 2, "--picture: expected"),
         (["audit", *one, motion, "--picture", "a.png", "--json", "a.png"], 2, "among the inputs"),
         (["conformalize", "--pairs", tmp_path / "no.txt", *output], 2, "no line in"),
