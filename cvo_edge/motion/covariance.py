@@ -52,6 +52,8 @@ _STEP = 0.7
 # Squares are clipped at so many times the predicted variance: outliers decide on no variance.
 _CLIP = 16.0
 _LEAST = 1e-12
+# Variances of 0.1 um and 0.1 urad more: of a planar robot, filters could not factorise the others.
+FLOOR = 1e-14 * np.eye(6)
 _RIDGE = 1e-4
 
 
@@ -63,7 +65,7 @@ class Shape(NamedTuple):
     def covariance(self, scales: Array) -> Array:
         """Return Sigma (m, 6, 6) of motions with scales (m, 8 or 6)."""
         u = scales[:, :6]
-        return np.asarray(u[:, :, np.newaxis] * self.matrix * u[:, np.newaxis])
+        return np.asarray(u[:, :, np.newaxis] * self.matrix * u[:, np.newaxis] + FLOOR)
 
 
 def adjoint(steps: Array) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.documents import shown
 from cvo_edge.errors import UsageError
-from cvo_edge.motion.covariance import SPANS_S, Shape
+from cvo_edge.motion.covariance import FLOOR, SPANS_S, Shape
 from cvo_edge.motion.drift import Familiar
 from cvo_edge.motion.errors import motions
 from cvo_edge.motion.fitting import ERRORS, Scale, predicted_bias, predicted_scale
@@ -296,7 +296,7 @@ class MotionCalibration:
         They are in the body frame at the end of the step.
         """
         diagonal = np.array(self.file.integrated) * scales**2
-        return np.asarray(diagonal[:, :, np.newaxis] * np.eye(6))
+        return np.asarray(diagonal[:, :, np.newaxis] * np.eye(6) + FLOOR)
 
     def same_rate(self, period_s: float) -> bool:
         """Whether poses come at the calibration's rate, which horizons in frames rely on."""

@@ -84,3 +84,15 @@ def test_both_covariances_fit_drives_with_independent_steps() -> None:
         assert 0.6 < np.mean([each.nees for each in over]) < 1.5, over
         assert np.mean([each.nees_inside for each in over]) > 0.8, over
     assert [each.seconds for each in report.recordings[0].integrated] == [1.0, 2.0, 5.0, 10.0]
+
+
+def test_filters_can_factorise_the_covariance_of_a_planar_robot() -> None:
+    """Height, roll and pitch never err, and their scale tends to nothing."""
+    generator = np.random.default_rng(3)
+    plane = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+    shape = fit_shape(Here([plane * generator.normal(size=(200, 6)) for _ in range(3)]), "abc")
+    scales = np.where(plane > 0.0, 1e-2, 4e-9)[np.newaxis]
+    turn = geometry.quaternion_exp(np.array([[0.3, -0.2, 2.0]]))
+    (covariance,) = in_fixed_axes(shape.covariance(scales), turn)
+    np.linalg.cholesky(covariance)
+    assert np.sqrt(np.linalg.eigvalsh(covariance)[0]) > 0.5e-7
