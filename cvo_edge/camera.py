@@ -45,6 +45,13 @@ LEAST_SIDE, _LARGEST_FILE = 16, 64 * 1024
 _SHORT = re.compile(
     r"(?P<width>\d+)x(?P<height>\d+),(?P<fx>[^,]+),(?P<fy>[^,]+),(?P<cx>[^,]+),(?P<cy>[^,]+)"
 )
+# Values of a sensor.yaml of the ASL layout (Burri et al. 2016): words, or lists of numbers.
+_YAML_VALUE = re.compile(r"^(\w+):[ \t]*([^\[\s]+|\[[^\]]*\])[ \t]*$", re.MULTILINE)
+_YAML_MODELS: dict[str | None, Distortion] = {
+    "radial-tangential": "radial_tangential",
+    "radtan": "radial_tangential",
+    "equidistant": "equidistant",
+}
 # Wider pinhole images exist in files with a mistake only.
 _WIDEST_DEG = 170.0
 
@@ -174,7 +181,8 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit
 def read_camera(given: str | Path) -> Camera:
     """Read a camera from a JSON file with the fields of ``Camera``, or from a short text.
 
-    The text is ``WIDTHxHEIGHT,FX,FY,CX,CY``. Raises UsageError.
+    The text is ``WIDTHxHEIGHT,FX,FY,CX,CY``. A file ``*.yaml`` is a ``sensor.yaml`` of the ASL
+    layout, as EuRoC has it. Raises UsageError.
     """
     path = Path(given)
     short = _SHORT.fullmatch(str(given))
@@ -190,11 +198,39 @@ def read_camera(given: str | Path) -> Camera:
             f"camera: expected WIDTHxHEIGHT,FX,FY,CX,CY or a JSON file, found {given}: no such file"
         )
     content = read_regular_file(path, _LARGEST_FILE, UsageError, links=True)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return _from_sensor_yaml(path, content.decode("utf-8", "replace"))
     try:
         return msgspec.json.decode(content, type=Camera)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         form = '{"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0}'
         raise UsageError(f"{path}: expected JSON such as {form}, found: {error}") from None
+
+
+def _from_sensor_yaml(path: Path, text: str) -> Camera:
+    values = dict(_YAML_VALUE.findall(re.sub("#.*", "", text)))
+    try:
+        width, height = map(int, _listed(values["resolution"]))
+        fx, fy, cx, cy = map(float, _listed(values["intrinsics"]))
+        coefficients = tuple(map(float, _listed(values["distortion_coefficients"])))
+        if values["camera_model"] != "pinhole":
+            raise KeyError("camera_model")
+        lens = {
+            "distortion": _YAML_MODELS[values["distortion_model"]],
+            "coefficients": coefficients,
+        }
+        pinhole = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        return msgspec.convert(pinhole | lens, Camera)
+    except (KeyError, ValueError) as error:
+        found = f"none for {error}" if isinstance(error, KeyError) else str(error)
+        raise UsageError(
+            f"{path}: expected a sensor.yaml with resolution, camera_model pinhole, intrinsics, "
+            f"distortion_model and distortion_coefficients, found {found}"
+        ) from None
+
+
+def _listed(text: str) -> list[str]:
+    return text.strip("[]").split(",")
 
 
 def checked_camera(camera: object) -> Camera:

@@ -28,7 +28,7 @@ from cvo_edge.trajectories.poses import quaternion_poses
 from cvo_edge.trajectories.tables import read_rows, seconds_to_ns
 from cvo_edge.trajectories.trajectory import NONE_SKIPPED
 from cvo_edge.trajectories.tum import FORM
-from cvo_edge.vocabulary import MotionCovariance, MotionFormat
+from cvo_edge.vocabulary import Existing, MotionCovariance, MotionFormat
 
 # Records of a file are written in pieces; those of a stream, each at once.
 _AT_ONCE = 256
@@ -42,6 +42,7 @@ def annotate_file(
     level: Level,
     poses: Poses,
     output: str,
+    existing: Existing,
     written_as: MotionFormat,
     anchors: Path | None,
     covariance: MotionCovariance | None,
@@ -57,7 +58,7 @@ def annotate_file(
     )
     unbounded: Counter[str] = Counter()
     counted = _counted(records, unbounded)
-    _write(calibration, level, counted, output, written_as, _AT_ONCE)
+    _write(calibration, level, counted, output, existing, written_as, _AT_ONCE)
     if 2 * (lost := unbounded.total()) > len(poses.poses) >= _MANY:
         ((reason, count),) = unbounded.most_common(1)
         say(
@@ -94,6 +95,7 @@ def annotate_stream(
     calibration: MotionCalibration,
     level: Level,
     output: str,
+    existing: Existing,
     written_as: MotionFormat,
     covariance: MotionCovariance | None,
 ) -> None:
@@ -105,7 +107,7 @@ def annotate_stream(
     tracker = MotionTracker(calibration, *level, covariance)
     lines = _lines(calibration.file.columns, calibration.pointed)
     records = (tracker.step(*each) for each in lines)
-    _write(calibration, level, records, output, written_as, 1)
+    _write(calibration, level, records, output, existing, written_as, 1)
 
 
 def format_of(path: str, format: MotionFormat | None) -> MotionFormat:
@@ -157,13 +159,14 @@ def _write(
     level: Level,
     records: Iterable[MotionRecord],
     output: str,
+    existing: Existing,
     written_as: MotionFormat,
     at_once: int,
 ) -> None:
     heading, text = _FORMATS[written_as]
     first = heading(calibration, level)
     every = iter(records)
-    with LineFile(output) as lines:
+    with LineFile(output, existing, say) as lines:
         while found := list(islice(every, at_once)):
             lines.write(first + text(found))
             first = b""

@@ -10,7 +10,13 @@ import typer
 
 from cvo_edge.errors import GateError, UsageError
 from cvo_edge.files import refuse_overwriting, write_text
-from cvo_edge.programs.options import INTERVALS, REPORT, JsonFileOption
+from cvo_edge.programs.options import (
+    INTERVALS,
+    REPORT,
+    ForceOption,
+    JsonFileOption,
+    existing_file,
+)
 from cvo_edge.vocabulary import (
     MotionCovariance,
     MotionEngine,
@@ -240,6 +246,7 @@ def annotate(
             rich_help_panel=REPORT,
         ),
     ] = None,
+    force: ForceOption = False,
     times: TimesOption = None,
     fps: RateOption = None,
     anchors: Annotated[
@@ -269,7 +276,7 @@ def annotate(
 
     calibration = MotionCalibration.load(motion)
     level = calibration.level(confidence, rule, scope)
-    written_as = format_of(output, format)
+    written_as, existing = format_of(output, format), existing_file(False, force, output)
     if covariance is not None and written_as != "jsonl":
         raise UsageError(f"--covariance: expected the format jsonl, found {written_as}")
     if calibration.pointed and written_as == "csv":
@@ -279,11 +286,11 @@ def annotate(
             raise UsageError("--anchors: expected a file of poses, found standard input")
         Reading(None, times, fps).check_used(timed=False)
         refuse_overwriting(output, motion)
-        annotate_stream(calibration, level, output, written_as, covariance)
+        annotate_stream(calibration, level, output, existing, written_as, covariance)
         return
     refuse_overwriting(output, estimate, motion, times, anchors)
     poses = Reading(None, times, fps).one(Path(estimate))
-    annotate_file(calibration, level, poses, output, written_as, anchors, covariance)
+    annotate_file(calibration, level, poses, output, existing, written_as, anchors, covariance)
 
 
 def audit(

@@ -17,11 +17,13 @@ from cvo_edge.programs.motion import ConfidenceOption, RuleOption, ScopeOption
 from cvo_edge.programs.options import (
     INTERVALS,
     REPORT,
+    ForceOption,
     MaxFramesOption,
     OutputOption,
     StampsOption,
     TimeoutOption,
     examples,
+    existing_file,
 )
 from cvo_edge.vocabulary import MotionRule, Scope
 
@@ -54,7 +56,7 @@ def odometry(
         typer.Option(
             "--camera",
             help="The camera: WIDTHxHEIGHT,FX,FY,CX,CY, or a JSON file with these fields and the "
-            "distortion.",
+            "distortion, or a sensor.yaml as EuRoC has it.",
             readable=False,
             show_default=False,
             rich_help_panel="Input",
@@ -70,6 +72,7 @@ def odometry(
             rich_help_panel=REPORT,
         ),
     ] = None,
+    force: ForceOption = False,
     scale: Annotated[
         Path | None,
         typer.Option(
@@ -124,7 +127,8 @@ def odometry(
     stamped = written_as == "tum" or scale is not None or tracker is not None
     first = _heading(calibrated, scale, written_as, tracker)
     seen: Counter[str] = Counter()
-    with LineFile(output) as lines, closing(front.stream(frames)) as steps:
+    existing = existing_file(False, force, written_as)
+    with LineFile(output, existing, say) as lines, closing(front.stream(frames)) as steps:
         try:
             for step in islice(steps, max_frames):
                 _check(step, source, calibrated, stamped=stamped)

@@ -64,7 +64,8 @@ CameraOption = Annotated[
     Path | None,
     typer.Option(
         "--camera",
-        help="Another camera: WIDTHxHEIGHT,FX,FY,CX,CY, or a JSON file with these fields.",
+        help="Another camera: WIDTHxHEIGHT,FX,FY,CX,CY, a JSON file with these fields, or a "
+        "sensor.yaml as EuRoC has it.",
         readable=False,
         show_default=False,
         rich_help_panel="Input",

@@ -222,6 +222,45 @@ def test_a_camera_is_a_word_or_a_file(tmp_path):
         read_camera("320x240,nan,292.5,159.5,119.5")
 
 
+SENSOR = """%YAML:1.0
+# General sensor definitions.
+T_BS:
+  data: [0.0, 1.0,
+         2.0, 3.0]
+resolution: [320, 240]
+camera_model: pinhole
+intrinsics: [292.5, 293.0, 159.5, 119.5] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]
+"""
+
+
+def test_a_camera_is_a_sensor_yaml(tmp_path):
+    path = tmp_path / "sensor.yaml"
+    path.write_text(SENSOR)
+    assert read_camera(path) == Camera(
+        width=320,
+        height=240,
+        fx=292.5,
+        fy=293.0,
+        cx=159.5,
+        cy=119.5,
+        distortion="radial_tangential",
+        coefficients=(-0.28, 0.07, 0.0002, 1.8e-05),
+    )
+    for old, new in (
+        ("resolution", "size"),
+        ("pinhole", "omni"),
+        ("radial-tangential", "fov"),
+        ("292.5, ", ""),
+        ("-0.28, 0.07, ", ""),
+        ("320", "wide"),
+    ):
+        path.write_text(SENSOR.replace(old, new))
+        with pytest.raises(UsageError, match=r"sensor.yaml: expected a sensor.yaml with res"):
+            read_camera(path)
+
+
 def test_the_sizes_of_images_and_camera_agree(stated):
     calibration = stated(camera=CAMERA).calibration
     check_rules(calibration)
