@@ -11,7 +11,7 @@ from cvo_edge.conformal import capped_quantile
 from cvo_edge.errors import UsageError
 from cvo_edge.motion.errors import errors_of
 from cvo_edge.motion.fitting import Normal, bias_sums, predict_bias, solve_bias
-from cvo_edge.motion.horizon_fit import stretched
+from cvo_edge.motion.horizon_fit import crossed, stretched
 from cvo_edge.motion.horizons import Horizon, starts
 from cvo_edge.motion.kept import Kept
 from cvo_edge.motion.recordings import about, limits_of, trace_of
@@ -252,6 +252,12 @@ def test_a_tube_is_wider_where_errors_are_larger(depends: bool) -> None:
     # The six degrees of freedom, each in its unit, are all inside as often as stated.
     q = Scores(tube.scores, "abcdef").thresholds("mean", 0.9)
     assert abs(np.mean(np.concatenate(tube.scores) <= q) - 0.9) < 0.01
+
+
+def test_a_fold_is_fitted_on_the_others() -> None:
+    sums = [Normal(np.array(2.0**place), np.zeros(1)) for place in range(4)]
+    without, whole = crossed(sums, [0, 1, 1, 2], lambda each: each.left)
+    assert (without, whole) == ([14.0, 9.0, 7.0], 15.0)
 
 
 def test_a_flat_scale_is_stretched_and_a_fitting_one_is_not() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from cvo_edge import geometry
 from cvo_edge.errors import CalibrationFileError, SourceError, UsageError
 from cvo_edge.estimate import Status
 from cvo_edge.motion.adaptation import MotionAdaptation
@@ -163,6 +164,8 @@ def test_a_stream_gives_the_records_of_a_file(
     poses[40] = np.nan
     poses[80:, :3] += 50.0
     stamps[110:] += 10**9
+    turn = geometry.quaternion_exp(np.array([0.0, 0.0, 2.0]))
+    poses[130:, 3:] = geometry.quaternion_multiply(poses[130:, 3:], turn)
     level = calibration.level()
     whole = list(annotate(calibration, level, stamps, poses, {}, covariance=covariance))
     tracker = MotionTracker(calibration, covariance=covariance)
@@ -174,9 +177,10 @@ def test_a_stream_gives_the_records_of_a_file(
         (41, MotionReason.GAP),
         (80, MotionReason.JUMP),
         (110, MotionReason.GAP),
+        (130, MotionReason.JUMP),
     ]
     assert {record.status for record in whole if not record.reasons} == {Status.OK}
-    for seq in (0, 40, 41, 80, 110):
+    for seq in (0, 40, 41, 80, 110, 130):
         assert whole[seq].status != Status.OK
         assert not any(each.bounded for each in whole[seq].motion)
 
