@@ -21,6 +21,7 @@ def main() -> NoReturn:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     process.keep_libraries_off_stderr()
     process.end_within_a_second()
+    process.follow_hang_ups()
     run()
 
 

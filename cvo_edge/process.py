@@ -19,6 +19,7 @@ import typer
 from typer.main import get_command
 
 from cvo_edge.errors import CvoError, SinkError, SourceError, printable
+from cvo_edge.output.lines import reopen_files
 
 # How long regular cleanup after a signal may take.
 _PATIENCE_S = 0.8
@@ -78,8 +79,8 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
         code = 0
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
-    except Terminated:
-        code = 128 + signal.SIGTERM
+    except Terminated as ended:
+        code = int(ended.code or 0)
     except SystemExit as leaving:
         # Ray replaces the exception that a signal raises while it waits.
         if _terminated.is_set():
@@ -151,10 +152,34 @@ def _drop_stdout() -> None:
 
 
 class Terminated(SystemExit):
-    """Raised on SIGTERM, to close open files and end the process."""
+    """Raised on SIGTERM and, in a terminal, SIGHUP, to close open files and end the process."""
 
 
 _terminated = threading.Event()
+
+
+def follow_hang_ups() -> None:
+    """Have SIGHUP open output files again, as log rotation asks daemons to.
+
+    In a terminal, it ends the process as ever: the terminal is gone. Ignored by the parent process
+    (nohup), it stays ignored.
+    """
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, _hang_up)
+
+
+def _hang_up(number: int, frame: FrameType | None) -> None:
+    if _has_terminal():
+        _terminate(number, frame)
+    reopen_files()
+
+
+def _has_terminal() -> bool:
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
 
 
 def _terminate(number: int, _: FrameType | None) -> NoReturn:

@@ -123,7 +123,8 @@ class LineFile:
 
     @property
     def started(self) -> bool:
-        """Whether anything was written."""
+        """Whether the file has a beginning; one that was opened again and is empty has none."""
+        self._open_again()
         return self._started
 
     def write(self, line: bytes) -> None:
@@ -131,12 +132,12 @@ class LineFile:
 
         Raises SinkError if writing fails and BrokenPipeError if the reader closed the pipe.
         """
-        if not self._started:
+        if not self.started:
             self._started = True
             # Keep the old contents until the first new line is ready.
             self._make_room()
         elif self._owned:
-            self._follow_name()
+            self._tell_of_a_lost_name()
         written = 0
         while written < len(line):
             try:
@@ -164,18 +165,22 @@ class LineFile:
             end = _end_of_lines(self._name)
         os.ftruncate(self._descriptor, end)
 
-    def _follow_name(self) -> None:
-        """Open the file again if told to; tell once if its name is gone or another file's."""
-        if self._opened != _reopening:
-            self._opened = _reopening
-            try:
-                descriptor = _opened(self._name)
-            except OSError as error:
-                raise SinkError(f"{self._name}: cannot be opened again: {error.strerror}") from None
-            os.close(self._descriptor)
-            self._descriptor = descriptor
-            self._alone()
-        elif self._told is not None and not self._has_name():
+    def _open_again(self) -> None:
+        """Open the file by its name again if ``reopen_files`` was called."""
+        if not self._owned or self._opened == _reopening:
+            return
+        self._opened = _reopening
+        try:
+            descriptor = _opened(self._name)
+        except OSError as error:
+            raise SinkError(f"{self._name}: cannot be opened again: {error.strerror}") from None
+        os.close(self._descriptor)
+        self._descriptor = descriptor
+        self._alone()
+        self._started &= os.fstat(descriptor).st_size > 0
+
+    def _tell_of_a_lost_name(self) -> None:
+        if self._told is not None and not self._has_name():
             self._told(
                 f"{self._name}: was renamed or removed; records still go to that file. SIGHUP "
                 "opens a new one"

@@ -5,6 +5,7 @@ import dataclasses
 import errno
 import json
 import os
+import signal
 from pathlib import Path
 
 import msgspec
@@ -22,6 +23,7 @@ from cvo_edge import (
     Status,
     UsageError,
     open_source,
+    process,
 )
 from cvo_edge.ground_truth import open_ground_truth
 from cvo_edge.output.lines import LineFile, reopen_files
@@ -351,3 +353,40 @@ def test_a_renamed_file_is_told_once_and_reopened_when_asked(tmp_path):
     assert [line.split(": ")[1][:11] for line in told] == ["was renamed"]
     assert (tmp_path / "a.jsonl.1").read_bytes() == b"first\nsecond\nthird\n"
     assert path.read_bytes() == b"fourth\n"
+
+
+def test_a_file_that_is_opened_again_has_a_header_of_its_own(tmp_path, estimates):
+    path = tmp_path / "a.csv"
+    with Sink(str(path), "csv") as sink:
+        sink.write(estimates[0])
+        path.rename(tmp_path / "a.csv.1")
+        reopen_files()
+        sink.write(estimates[1])
+        reopen_files()
+        sink.write(estimates[2])
+    heading = (tmp_path / "a.csv.1").read_text().splitlines()[0]
+    lines = path.read_text().splitlines()
+    assert lines[0] == heading
+    assert len(lines) == 3
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_hang_up_opens_files_again_unless_a_terminal_is_gone(monkeypatch, tmp_path, terminal):
+    path = tmp_path / "a.jsonl"
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    monkeypatch.setattr(process, "_has_terminal", lambda: terminal)
+    try:
+        process.follow_hang_ups()
+        with LineFile(str(path)) as lines:
+            lines.write(b"first\n")
+            path.unlink()
+            if terminal:
+                with pytest.raises(process.Terminated) as ended:
+                    signal.raise_signal(signal.SIGHUP)
+                assert ended.value.code == 129
+                return
+            signal.raise_signal(signal.SIGHUP)
+            lines.write(b"second\n")
+        assert path.read_bytes() == b"second\n"
+    finally:
+        signal.signal(signal.SIGHUP, before)
