@@ -33,6 +33,8 @@ _BAND_PROBABILITY = 0.99
 _LEAST_WIDTH = 1e-3
 _ROUNDING = 1e-9
 _LARGEST_LOG = 700.0
+# Ratio of variances below which a covariance has no inverse.
+_SINGULAR = 1e-14
 
 
 def point_error(seen: Observed) -> dict[str, float]:
@@ -214,14 +216,17 @@ class Sets:
         """Return how well the covariances of ``PoseInterval.covariance`` fit the errors.
 
         ``mean`` and ``median`` of NEES / 6, whose mean is 1 where they fit, and ``inside``, the
-        share of NEES up to the chi-square quantile at 0.9. None if no set is bounded.
+        share of NEES up to the chi-square quantile at 0.9. Sets that are unbounded or have no width
+        do not count; None if all are such.
         """
         pairs = zip(sets, self.seen.point, strict=True)
         found = np.array([in_chart(s, p, entry.confidence, entry.scope) for s, p in pairs])
-        finite = np.isfinite(found).all(axis=(1, 2))
-        if not finite.any():
+        rows = np.flatnonzero(np.isfinite(found).all(axis=(1, 2)))
+        spread = np.linalg.eigvalsh(found[rows])
+        rows = rows[spread[:, 0] > _SINGULAR * spread[:, -1]]
+        if not rows.size:
             return None
-        values = nees((self.seen.truth - self.seen.point)[finite], found[finite])
+        values = nees((self.seen.truth - self.seen.point)[rows], found[rows])
         return {
             "mean": float(values.mean() / 6.0),
             "median": float(np.median(values) / 6.0),
