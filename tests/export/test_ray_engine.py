@@ -74,7 +74,7 @@ def test_outcomes_are_those_of_the_tasks_and_a_killed_worker_is_run_again(
         "die": partial(die_once, tmp_path / "died"),
         "where": partial(write, Path("relative"), "to the folder of the study"),
     }
-    found = {}
+    found, begun = {}, Path.cwd()
     before = signal.getsignal(signal.SIGTERM)
     with ray_engine() as run:
         # The engine must not replace the handler that sets our exit codes.
@@ -91,6 +91,8 @@ def test_outcomes_are_those_of_the_tasks_and_a_killed_worker_is_run_again(
     assert found["die"] is None
     assert (tmp_path / "died").read_text() == "twice"
     (tmp_path / "died").unlink()
+    # Workers of another session find modules in the folder where it begins.
+    monkeypatch.chdir(begun)
     told = []
     with ray_cluster("test", "cvo-edge") as ray:
         numbers = OnRay.of(ray, list(range(100)), lambda *words: told.append(words))
