@@ -1,4 +1,4 @@
-"""MCAP files of ROS 2 messages, which Foxglove, PlotJuggler, rosbag2 and evo read.
+"""MCAP files of ROS 2 messages, which rosbags, mcap-ros2-support and evo read.
 
 A file that is being written is not chunked and is flushed after each frame, so that a process that
 is killed loses nothing that it reported; what is then missing at the end of the file, ``recover``
