@@ -22,8 +22,9 @@ import numpy as np
 from played import CONFIDENCE, Array, Subject, by_recording, remembered
 from provenance import write_result
 
-from cvo_edge.estimate import PoseInterval, Reason
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.odometer import Odometer
+from cvo_edge.record import Reason
 from cvo_edge.sets import ConformalSet
 from cvo_export.bundles.choice import workspace
 from cvo_export.data.noise import KINDS, Noise, noisy

@@ -25,8 +25,8 @@ from wrong_kinds import KINDS, Kind, frame
 from cvo_edge.camera import Camera
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import Reason
 from cvo_edge.odometer import Odometer
+from cvo_edge.record import Reason
 from cvo_edge.vocabulary import Scope
 from cvo_export.data.splits import same_split
 from cvo_export.datasets import PoseDataset, open_dataset

@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 from provenance import RESULTS, ROOT, write_result
 
-from cvo_edge.estimate import Reason
 from cvo_edge.input.frame_checks import Look, StreamChecks, image_doubt
 from cvo_edge.input.preprocess import model_input
 from cvo_edge.input.sources import open_source
+from cvo_edge.record import Reason
 
 Image = NDArray[np.uint8]
 Images = list[Image]

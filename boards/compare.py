@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge import geometry
-from cvo_edge.estimate import Record, RecordedInterval
 from cvo_edge.pose import Chart
+from cvo_edge.record import Record, RecordedInterval
 from cvo_edge.sets import Bands, ConformalSet
 
 Array = NDArray[np.float64]

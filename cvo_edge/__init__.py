@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         SourceError,
         UsageError,
     )
-    from cvo_edge.estimate import PoseInterval, Reason, Record, Status
+    from cvo_edge.estimate import PoseInterval
     from cvo_edge.frontend.odometry import FrontEnd
     from cvo_edge.frontend.steps import Step, StepReason
     from cvo_edge.input.frame import Frame
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from cvo_edge.odometer import Odometer
     from cvo_edge.output.records import Header, Records, read_records
     from cvo_edge.pose import Chart, Pose
+    from cvo_edge.record import Reason, Record, Status
     from cvo_edge.sets import ConformalSet, Ellipsoids
 
 __version__ = VERSION
@@ -114,12 +115,12 @@ _HOMES = {
     "Odometer": "odometer",
     "Pose": "pose",
     "PoseInterval": "estimate",
-    "Reason": "estimate",
-    "Record": "estimate",
+    "Reason": "record",
+    "Record": "record",
     "Records": "output.records",
     "SinkError": "errors",
     "SourceError": "errors",
-    "Status": "estimate",
+    "Status": "record",
     "Step": "frontend.steps",
     "StepReason": "frontend.steps",
     "UsageError": "errors",

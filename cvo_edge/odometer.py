@@ -23,7 +23,7 @@ from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.engine.observation import Observation, Observer
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import ModelError, UsageError
-from cvo_edge.estimate import Drift, PoseInterval, Reason, Status
+from cvo_edge.estimate import Drift, PoseInterval
 from cvo_edge.input.clock import SYSTEM_CLOCK
 from cvo_edge.input.frame import Frame, checked_hint
 from cvo_edge.monitor.adaptation import Adaptation
@@ -31,6 +31,7 @@ from cvo_edge.monitor.labelled import Labelled
 from cvo_edge.monitor.watch import StreamWatch
 from cvo_edge.pose import Pose
 from cvo_edge.processed import Processed
+from cvo_edge.record import Reason, Status
 from cvo_edge.scheduling import checked_mode, plan, run_stream
 from cvo_edge.sets import ConformalSet, unbounded_set
 from cvo_edge.vocabulary import Scope

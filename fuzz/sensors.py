@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.input.decoding import decode_image
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.frame_checks import Look, StreamChecks, image_doubt
 from cvo_edge.input.preprocess import model_input, to_bgr8
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
+from cvo_edge.record import Reason, Status
 from fuzz.bundles import ARTIFACTS
 from fuzz.mutate import Generator
 from fuzz.trials import Tally

@@ -22,13 +22,13 @@ from cvo_edge.engine.loading import open_session
 from cvo_edge.engine.model_cache import CachedModel
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import Reason
 from cvo_edge.heads import Head
 from cvo_edge.input import preprocess
 from cvo_edge.input.frame_checks import Look, image_doubt
 from cvo_edge.input.image_checks import ROUNDING_PX, KnownImages, StreamSizes
 from cvo_edge.input.view import View, check_same_view, crop_view, matched_view, seen_camera
 from cvo_edge.pose import Chart
+from cvo_edge.record import Reason
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from msgspec.structs import replace
 
 from cvo_edge import geometry
 from cvo_edge.camera import Camera
-from cvo_edge.estimate import Status
 from cvo_edge.frontend.steps import Step, StepReason
 from cvo_edge.motion.records import MotionHeader, MotionInterval, MotionReason, MotionRecord
 from cvo_edge.output.sinks import tum_line
+from cvo_edge.record import Status
 from cvo_edge.trajectories.tum import FORM
 from cvo_edge.vocabulary import VERSION
 

@@ -8,8 +8,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.estimate import Status
 from cvo_edge.frontend.essential import Motion
+from cvo_edge.record import Status
 
 Array = NDArray[np.float64]
 

@@ -16,9 +16,9 @@ from cvo_edge.bundle.format import NOVELTY_OUTPUT, Calibration, DifficultySpec, 
 from cvo_edge.camera_check import CameraCheck
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError
-from cvo_edge.estimate import Reason
 from cvo_edge.heads.difficulty import Difficulty
 from cvo_edge.input.view import SeenCamera
+from cvo_edge.record import Reason
 from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import Joint, Scope
 

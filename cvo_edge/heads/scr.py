@@ -32,11 +32,11 @@ from cvo_edge.bundle.format import Calibration, Number, Positive, SixPositive, T
 from cvo_edge.camera_check import CameraCheck, LensLimits, fitted_limits
 from cvo_edge.conformal import JointScale, LinearScale
 from cvo_edge.errors import CalibrationFileError, UsageError
-from cvo_edge.estimate import Reason
 from cvo_edge.heads.base import Candidate, Head, Limit, Solved, Solver
 from cvo_edge.heads.cqr import below_spread, infinite_where_null, refuse_negative
 from cvo_edge.input.view import SeenCamera
 from cvo_edge.pose_solver import PoseSolver, Solution, dispersion
+from cvo_edge.record import Reason
 from cvo_edge.sets import ConformalSet, Ellipsoids, scaled_distance, unbounded_set
 from cvo_edge.vocabulary import Joint, Scope
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.estimate import Reason
 from cvo_edge.input.frame_checks import Look
+from cvo_edge.record import Reason
 
 # A pixel has colour if its channels differ by more than this, in grey levels out of 255: chroma of
 # a grey scene that was encoded stays below. An image has colour if this share of its pixels has:

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvo_edge.estimate import Reason
+from cvo_edge.record import Reason
 
 Image8 = NDArray[np.uint8]
 Numbers = NDArray[np.float32]

@@ -31,7 +31,8 @@ from cvo_edge.bundle.format import (
     AlarmSpec,
     Calibration,
 )
-from cvo_edge.estimate import Drift, Reason
+from cvo_edge.estimate import Drift
+from cvo_edge.record import Reason
 
 # Share of known frames beyond the limit of single frames.
 LEVEL = 0.99

@@ -7,10 +7,11 @@ from typing import NamedTuple
 from cvo_edge.bundle.format import Calibration
 from cvo_edge.camera_check import LensEstimate
 from cvo_edge.engine.observation import Observation, Observer
-from cvo_edge.estimate import Drift, Reason
+from cvo_edge.estimate import Drift
 from cvo_edge.input.frame import Frame, checked_hint
 from cvo_edge.input.frame_checks import StreamChecks
 from cvo_edge.monitor.alarm import StreamAlarm, false_alarms
+from cvo_edge.record import Reason
 
 
 class Verdict(NamedTuple):

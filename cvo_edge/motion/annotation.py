@@ -13,7 +13,6 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import RecordedPose, Status
 from cvo_edge.motion.covariance import in_fixed_axes
 from cvo_edge.motion.drift import Running
 from cvo_edge.motion.intervals import Level, MotionCalibration, MotionHorizon, MotionWindow
@@ -27,6 +26,7 @@ from cvo_edge.motion.records import (
     with_tube,
 )
 from cvo_edge.motion.trace import Rows, rows_of
+from cvo_edge.record import RecordedPose, Status
 from cvo_edge.vocabulary import MotionCovariance
 
 Array = NDArray[np.float64]

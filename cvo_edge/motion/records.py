@@ -12,8 +12,8 @@ from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.estimate import RecordedPose, SixOrUnbounded, Status
 from cvo_edge.motion.intervals import Level, MotionCalibration
+from cvo_edge.record import RecordedPose, SixOrUnbounded, Status
 from cvo_edge.vocabulary import VERSION, MotionRule, Scope
 
 Array = NDArray[np.float64]

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.documents import shown
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import Status
 from cvo_edge.motion.adaptation import MotionAdaptation
 from cvo_edge.motion.annotation import status_of
 from cvo_edge.motion.covariance import in_fixed_axes
@@ -39,6 +38,7 @@ from cvo_edge.motion.records import (
 from cvo_edge.motion.relative import motion, residual
 from cvo_edge.motion.trace import column_logarithms, since_numbers
 from cvo_edge.pose import Pose
+from cvo_edge.record import Status
 from cvo_edge.vocabulary import MotionCovariance, MotionRule, Scope
 
 Array = NDArray[np.float64]

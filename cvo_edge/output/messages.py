@@ -26,9 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import PoseInterval, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.output.records import Header
 from cvo_edge.pose import Pose
+from cvo_edge.record import Status
 
 Array = NDArray[np.float64]
 Content = dict[str, Any]

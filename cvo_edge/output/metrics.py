@@ -7,7 +7,8 @@ from types import TracebackType
 import numpy as np
 
 from cvo_edge.errors import SinkError, UsageError
-from cvo_edge.estimate import PoseInterval, Status
+from cvo_edge.estimate import PoseInterval
+from cvo_edge.record import Status
 
 _ADDRESS = "127.0.0.1"
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.033, 0.05, 0.1, 0.2, 0.5, 1.0)

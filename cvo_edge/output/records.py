@@ -16,15 +16,9 @@ from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Calibration, Quaternion
 from cvo_edge.errors import SourceError
-from cvo_edge.estimate import (
-    BandsOrUnbounded,
-    Drift,
-    PoseInterval,
-    Record,
-    RecordedRegion,
-    SixOrUnbounded,
-)
+from cvo_edge.estimate import Drift, PoseInterval
 from cvo_edge.pose import Chart, Pose, Rotation
+from cvo_edge.record import BandsOrUnbounded, Record, RecordedRegion, SixOrUnbounded
 from cvo_edge.sets import Bands, ConformalSet, Ellipsoids, unbounded_set
 from cvo_edge.vocabulary import VERSION, Precision, Provider, Scope
 

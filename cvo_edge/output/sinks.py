@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import BandsOrUnbounded, PoseInterval
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.output.lines import LineFile
 from cvo_edge.output.records import Header
 from cvo_edge.output.table import table_heading, table_line
+from cvo_edge.record import BandsOrUnbounded
 from cvo_edge.vocabulary import Existing, Format
 
 Array = NDArray[np.float64]

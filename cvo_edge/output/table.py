@@ -7,7 +7,8 @@ import re
 import unicodedata
 from collections.abc import Iterable
 
-from cvo_edge.estimate import PoseInterval, RecordedInterval
+from cvo_edge.estimate import PoseInterval
+from cvo_edge.record import RecordedInterval
 
 _COLUMNS, _NAME_COLUMNS = 80, 12
 # Cell widths, including a leading blank: three for the position, six for half-widths.

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError, UsageError, printable
-from cvo_edge.estimate import Status
 from cvo_edge.motion.annotation import annotate
 from cvo_edge.motion.direction import check_same
 from cvo_edge.motion.files import Poses, says_unscaled, tum_names
@@ -24,6 +23,7 @@ from cvo_edge.motion.tracker import MotionTracker
 from cvo_edge.output.lines import LineFile
 from cvo_edge.output.sinks import tum_line
 from cvo_edge.process import say
+from cvo_edge.record import Status
 from cvo_edge.trajectories.poses import quaternion_poses
 from cvo_edge.trajectories.tables import read_rows, seconds_to_ns
 from cvo_edge.trajectories.trajectory import NONE_SKIPPED

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from cvo_edge.estimate import Status
 from cvo_edge.programs.run import RunSummary
+from cvo_edge.record import Status
 
 _SECONDS_BETWEEN_UPDATES = 0.1
 _WIDTH = 80

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.camera_check import LensEstimate
-from cvo_edge.estimate import Drift, PoseInterval, Status
+from cvo_edge.estimate import Drift, PoseInterval
 from cvo_edge.ground_truth import GroundTruth
 from cvo_edge.ground_truth.found import Key
 from cvo_edge.input.frame import Source
@@ -22,6 +22,7 @@ from cvo_edge.monitor.adaptation import Adapted
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.labels import Labels
 from cvo_edge.programs.measure import LatencyProfile, memory_mib
+from cvo_edge.record import Status
 
 Array = NDArray[np.float64]
 

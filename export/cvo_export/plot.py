@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from cvo_edge.bundle.format import Calibration, StillDof
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.estimate import PoseInterval, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.files import whole_file
 from cvo_edge.guarantee import statement
 from cvo_edge.input.frame import Frame
 from cvo_edge.odometer import Odometer
 from cvo_edge.pose import Chart
+from cvo_edge.record import Status
 from cvo_edge.vocabulary import Scope
 from cvo_export.datasets import PoseDataset
 from cvo_export.evaluate import subset_indices

@@ -7,8 +7,8 @@ import pytest
 from msgspec.structs import replace
 
 from cvo_edge.bundle.format import AlarmSpec
-from cvo_edge.estimate import Reason
 from cvo_edge.monitor.alarm import Running, StreamAlarm, alarm_statement, false_alarms, rank
+from cvo_edge.record import Reason
 
 _FIVE = (1.0,) * 5
 

@@ -7,8 +7,9 @@ from scipy.stats import chi2, norm
 from cvo_edge import geometry
 from cvo_edge.covariance import chi_square_quantile, nees
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import PoseInterval, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.pose import Chart, Pose
+from cvo_edge.record import Status
 from cvo_edge.sets import ConformalSet, Ellipsoids
 
 from .simulated_drives import composed

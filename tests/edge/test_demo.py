@@ -17,13 +17,14 @@ from cvo_edge import geometry
 from cvo_edge.bundle.format import DEGRADATION_OUTPUT, NOVELTY_OUTPUT, AlarmSpec
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.errors import SinkError, UsageError
-from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
 from cvo_edge.output.picture import HEIGHT, WIDTH, Span, draw_run, write_png
 from cvo_edge.pose import Chart, Pose
 from cvo_edge.programs.demo import EXPECTED, PACKAGED, demo, expected_coverage, what_happened
 from cvo_edge.programs.hand import HAND, covered, with_hand
+from cvo_edge.record import Reason, Status
 from cvo_edge.sets import ConformalSet, unbounded_set
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 
 from cvo_edge import geometry
 from cvo_edge.camera import Camera
-from cvo_edge.estimate import Status
 from cvo_edge.frontend.essential import LEAST_PARALLAX_PX, solve
 from cvo_edge.frontend.lens import Lens
 from cvo_edge.frontend.odometry import FrontEnd
@@ -20,6 +19,7 @@ from cvo_edge.motion.files import read_poses
 from cvo_edge.motion.relative import motion
 from cvo_edge.programs.cli import app
 from cvo_edge.programs.demo import BUNDLE
+from cvo_edge.record import Status
 from cvo_edge.trajectories.poses import read_pose_matrix
 
 CLIP = BUNDLE.parent / "clip"

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SourceError
-from cvo_edge.estimate import PoseInterval, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.ground_truth import open_ground_truth
 from cvo_edge.pose import Chart, Pose
+from cvo_edge.record import Status
 from cvo_edge.sets import unbounded_set
 from cvo_edge.trajectories.poses import read_pose_matrix
 

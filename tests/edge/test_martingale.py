@@ -20,13 +20,13 @@ from cvo_edge.errors import (
     SourceError,
     UsageError,
 )
-from cvo_edge.estimate import Record, Status
 from cvo_edge.monitor import martingale
 from cvo_edge.monitor.martingale import ALARM, RecordingMartingale, mean_novelty, mixture, p_value
 from cvo_edge.output.records import header_of
 from cvo_edge.pose import Chart
 from cvo_edge.programs.cli import app
 from cvo_edge.programs.drift import drift_lines, drift_of
+from cvo_edge.record import Record, Status
 
 _FIVE = (1.0,) * 5
 REFERENCE = (0.31, 0.29, 0.35, 0.3, 0.33, 0.28, 0.32, 0.34, 0.27, 0.36, 0.26)

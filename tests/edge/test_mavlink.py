@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from cvo_edge import geometry
-from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.input.clock import Clock
 from cvo_edge.output.messages import Placement
 from cvo_edge.pose import Chart, Pose
+from cvo_edge.record import Reason, Status
 from cvo_edge.sets import ConformalSet, unbounded_set
 
 mavutil = pytest.importorskip("pymavlink.mavutil")

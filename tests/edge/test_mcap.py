@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.estimate import Status
 from cvo_edge.output.messages import Placement, ros_image
 from cvo_edge.pose import Pose
+from cvo_edge.record import Status
 
 from .test_messages import HEADER, frame
 

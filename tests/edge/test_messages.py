@@ -8,11 +8,12 @@ import pytest
 
 from cvo_edge import geometry
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.output.messages import Placement, ros_messages, spoken
 from cvo_edge.output.records import Header, estimate_of, read_records
 from cvo_edge.output.sinks import Sink
 from cvo_edge.pose import Chart, Pose
+from cvo_edge.record import Reason, Status
 from cvo_edge.sets import ConformalSet, Ellipsoids, unbounded_set
 
 HALF = np.array([0.02, 0.01, 0.03, 0.008, 0.006, 0.01])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SinkError
-from cvo_edge.estimate import Drift, PoseInterval, Reason, Status
+from cvo_edge.estimate import Drift, PoseInterval
 from cvo_edge.pose import Chart, Pose
+from cvo_edge.record import Reason, Status
 from cvo_edge.sets import ConformalSet, unbounded_set
 
 parser = pytest.importorskip("prometheus_client.parser")

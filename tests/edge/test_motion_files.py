@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from cvo_edge import geometry
 from cvo_edge.errors import CalibrationFileError, SourceError, UsageError
-from cvo_edge.estimate import Status
 from cvo_edge.motion.adaptation import MotionAdaptation
 from cvo_edge.motion.annotation import annotate
 from cvo_edge.motion.audit import audit
@@ -35,6 +34,7 @@ from cvo_edge.motion.rounding import coefficients_of, scale_of
 from cvo_edge.motion.trace import scale_width
 from cvo_edge.motion.tracker import MotionTracker
 from cvo_edge.programs.cli import app
+from cvo_edge.record import Status
 from cvo_edge.spread import Here
 from cvo_edge.trajectories.interpolation import Track
 from cvo_edge.vocabulary import MOTION_RULES, MotionCovariance

@@ -11,8 +11,9 @@ from hypothesis.extra.numpy import arrays
 
 from cvo_edge import geometry
 from cvo_edge.errors import UsageError
-from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.pose import Chart, Pose
+from cvo_edge.record import Reason, Status
 from cvo_edge.sets import ConformalSet, unbounded_set
 
 rotvecs = arrays(np.float64, 3, elements=st.floats(-1.0, 1.0))

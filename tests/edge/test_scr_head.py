@@ -9,12 +9,12 @@ from cvo_edge.bundle.format import Threshold
 from cvo_edge.camera import Camera
 from cvo_edge.conformal import conformal_quantile
 from cvo_edge.errors import CalibrationFileError, UsageError
-from cvo_edge.estimate import Reason
 from cvo_edge.heads import fused as fused_module
 from cvo_edge.heads.fused import FusedHead, FusedParameters, Fusion, fuse
 from cvo_edge.heads.scr import ScrHead, ScrParameters, Signs
 from cvo_edge.input.view import SeenCamera, crop_view, seen_camera
 from cvo_edge.pose import Chart
+from cvo_edge.record import Reason
 
 CAMERA = Camera(width=640, height=480, fx=585.0, fy=585.0, cx=319.5, cy=239.5)
 FISHEYE = msgspec.structs.replace(

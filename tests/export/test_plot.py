@@ -7,8 +7,9 @@ import pytest
 from msgspec.structs import replace
 
 from cvo_edge.bundle.reading import read_calibration
-from cvo_edge.estimate import PoseInterval, Reason, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.pose import Chart, Pose
+from cvo_edge.record import Reason, Status
 from cvo_edge.sets import ConformalSet, unbounded_set
 from cvo_export.plot import Track, draw_dof, draw_from_above
 

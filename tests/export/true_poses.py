@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from cvo_edge.estimate import PoseInterval, Status
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.ground_truth import open_ground_truth
 from cvo_edge.input.image_files import frame_name
 from cvo_edge.input.sources import open_source
 from cvo_edge.pose import Chart, Pose
+from cvo_edge.record import Status
 from cvo_edge.sets import unbounded_set
 from cvo_export.datasets import open_dataset
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.engine.observation import Observation
-from cvo_edge.estimate import Reason
+from cvo_edge.record import Reason
 from cvo_export.data.pose_errors import pose_errors
 
 
