@@ -126,6 +126,14 @@ class PoseInterval:
         """Whether all twelve bounds are finite."""
         return bool(np.isfinite(self.lower).all() and np.isfinite(self.upper).all())
 
+    @property
+    def vouched(self) -> bool:
+        """Whether the pose may be shown or passed on as one that an interval stands behind.
+
+        True for a frame of status ``ok`` whose set is bounded.
+        """
+        return self.status is Status.OK and self.pose is not None and self.bounded
+
     def covers(self, pose: Pose | ArrayLike) -> NDArray[np.bool_]:
         """Tell per DoF, (6,), whether the set holds a ``T_world_camera`` (Pose or shape (7,)).
 
@@ -244,6 +252,38 @@ class PoseInterval:
             msgspec.json.encode(self.to_record(region=region))
         )
         return decoded
+
+    def draw(self, image: NDArray[Any]) -> NDArray[np.uint8]:
+        """Return a BGR copy of the frame's image with what this estimate says, for a screen.
+
+        A frame that is ``vouched`` shows its position, the axes of the world, and one bar for each
+        degree of freedom: its set about the pose, with half the width of its hull in cm or degrees.
+        Any other frame shows its status and reasons on a dark grey image.
+
+        Parameters
+        ----------
+        image
+            Shape (height, width) or (height, width, 1, 3 or 4), grey, BGR or BGRA, 8 or 16 bits;
+            bars need 160 x 120 pixels. It is not changed.
+
+        Raises UsageError for anything that is no such image.
+        """
+        # Imported here because it loads OpenCV.
+        from cvo_edge import overlay
+
+        vouched = None
+        if self.pose is not None and self.vouched:
+            point = self.chart.point(self.pose.to_array()).tolist()
+            rows = self.bands or tuple(
+                ((low, high),)
+                for low, high in zip(self.lower.tolist(), self.upper.tolist(), strict=True)
+            )
+            pieces = [
+                [(low - x, high - x) for low, high in row]
+                for row, x in zip(rows, point, strict=True)
+            ]
+            vouched = overlay.Vouched(self.chart.dof, pieces, self.pose.to_matrix()[:3, :3].T)
+        return overlay.draw(image, self.to_record(), vouched)
 
     def __str__(self) -> str:
         """One line: frame, status, reasons, position (m) and half-widths (cm, deg)."""

@@ -95,7 +95,7 @@ def spoken(estimate: PoseInterval, placement: Placement) -> Spoken | None:
         return None
     base, outer = placement.T_camera_base, placement.T_map_world
     pose = estimate.pose_of(base, outer)
-    if estimate.status is Status.OK and estimate.bounded:
+    if estimate.vouched:
         covariance = estimate.covariance(T_camera_base=base, T_map_world=outer)
         # A degree of freedom without width would be taken for certain.
         if np.isfinite(covariance).all() and np.all(np.diag(covariance) > 0.0):
