@@ -5,16 +5,35 @@ from __future__ import annotations
 import errno
 import glob
 import io
+import json
 import os
 import re
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from cvo_edge.errors import CvoError, SinkError, UsageError
+from cvo_edge.vocabulary import VERSION
+
+# Every file that this program writes says so, in the way of its format.
+SOFTWARE = f"cvo-edge {VERSION}"
+# So many bytes of a file tell whose it is.
+_SEEN = 4096
+_OURS = re.compile(
+    rb'\{.*"software": ?"cvo-edge '
+    rb"|#(?: kind: .*\n#)?(?: schema_version: .*\n#)? software: cvo-edge "
+    rb"|\x89PNG\r\n\x1a\n.*Software\0cvo-edge "
+    rb"|\x89MCAP0\r\n.{0,40}cvo-edge"
+    rb"|<\?xml .*<dc:title>cvo-edge "
+    # Of earlier versions, and tables.
+    rb'|\{"seq":|seq,stamp_ns,|Position and half the width',
+    re.DOTALL,
+)
+# A PDF says it before its table of objects.
+_PDF_END, _PDF_CREATOR = 1 << 16, b"/Creator (cvo-edge "
 
 
 def regular_file(
@@ -87,13 +106,13 @@ def whole_file(
     SinkError
         The file cannot be written.
     """
-    # A random name: processes on several machines may write to one shared folder.
-    unfinished = path.with_name(f"{path.name}.{os.urandom(4).hex()}.partial")
+    unfinished = _unfinished(path)
     try:
         if make_folder:
             path.parent.mkdir(parents=True, exist_ok=True)
         opened = unfinished.open("xb")
-    except OSError as error:
+    # A ValueError means that the name is not a valid file name.
+    except (OSError, ValueError) as error:
         raise _unwritable(path, error) from None
     try:
         with opened as stream:
@@ -114,8 +133,39 @@ def whole_file(
         raise
 
 
-def _unwritable(path: Path | str, error: OSError) -> SinkError:
-    return SinkError(f"{path}: cannot be written: {error.strerror}")
+@contextmanager
+def whole_path(output: str) -> Iterator[str]:
+    """Yield a name to write to; that file becomes ``output`` if the block ends without an error.
+
+    Standard output (``-``), pipes, devices and links are yielded themselves. Raises SinkError; one
+    that the block raises names ``output``.
+    """
+    path = Path(output)
+    if output == "-" or path.is_symlink() or (path.exists() and not path.is_file()):
+        yield output
+        return
+    unfinished = _unfinished(path)
+    try:
+        yield str(unfinished)
+        # Without any record, there may be no file.
+        if unfinished.exists():
+            unfinished.replace(path)
+    except SinkError as error:
+        raise SinkError(str(error).replace(str(unfinished), output)) from None
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    finally:
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+
+
+def _unfinished(path: Path) -> Path:
+    # A random name: processes on several machines may write to one shared folder.
+    return path.with_name(f"{path.name}.{os.urandom(4).hex()}.partial")
+
+
+def _unwritable(path: Path | str, error: OSError | ValueError) -> SinkError:
+    return SinkError(f"{path}: cannot be written: {getattr(error, 'strerror', error)}")
 
 
 def _flush_folder(folder: Path) -> None:
@@ -152,6 +202,16 @@ def write_text(target: str, text: str) -> None:
     write_whole(path, text)
 
 
+def write_report(target: str, report: Mapping[str, Any]) -> None:
+    """Write a report as indented JSON that names this program; as ``write_text``."""
+    write_text(target, json.dumps({"software": SOFTWARE, **report}, indent=1) + "\n")
+
+
+def picture_metadata(suffix: str) -> dict[str, str]:
+    """Return what matplotlib is to put into a ``.png``, ``.svg`` or ``.pdf`` that names us."""
+    return {"Software" if suffix.lower() == ".png" else "Creator": SOFTWARE}
+
+
 def own_folder(variable: str, base_variable: str, base: str) -> Path:
     """Return the folder that a variable names, or else ``cvo-edge`` in an XDG base folder.
 
@@ -180,13 +240,22 @@ def own_folder(variable: str, base_variable: str, base: str) -> Path:
         return Path(os.devnull) / "cvo-edge"
 
 
-def refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
-    """Raise UsageError if the output is an input, or lies in an input's folder or glob.
+def check_output(output: str | Path, *inputs: str | Path | None, force: bool = False) -> None:
+    """Raise UsageError for an output that must not be replaced.
 
-    Neither needs to exist: some inputs are written, too.
+    That is an input, a file in an input's folder or glob, and, without ``force``, a file that this
+    program did not write. Neither needs to exist: some inputs are written, too. Empty files, pipes
+    and devices are never refused.
     """
+    output = str(output)
     if output == "-":
         return
+    _refuse_inputs(output, inputs)
+    if not force:
+        _refuse_foreign(output)
+
+
+def _refuse_inputs(output: str, inputs: Iterable[str | Path | None]) -> None:
     written, place = Path(output), os.path.realpath(output)
     if any(given is not None and os.path.realpath(given) == place for given in inputs):
         raise UsageError(f"output: expected a new file, found {output} among the inputs")
@@ -199,6 +268,28 @@ def refuse_overwriting(output: str, *inputs: str | Path | None) -> None:
         files = [name, *glob.iglob(name, recursive=True), *glob.iglob(f"{glob.escape(name)}/*")]
         if any(os.path.exists(file) and written.samefile(file) for file in files):  # noqa: PTH110
             raise UsageError(f"output: expected a new file, found {output} among the inputs")
+
+
+def _refuse_foreign(output: str) -> None:
+    try:
+        with Path(output).open("rb", buffering=0) as stream:
+            found = os.fstat(stream.fileno())
+            if not stat.S_ISREG(found.st_mode):
+                return
+            beginning = stream.read(_SEEN)
+            ours = bool(_OURS.match(beginning))
+            if beginning.startswith(b"%PDF"):
+                stream.seek(max(0, found.st_size - _PDF_END))
+                ours = _PDF_CREATOR in stream.read(_PDF_END)
+    # A ValueError means that the name is not a valid file name. None there, or one that opening it
+    # for writing judges.
+    except (OSError, ValueError):
+        return
+    if beginning and not ours:
+        raise UsageError(
+            f"{output}: expected a new file or one of cvo-edge, found another one; choose another "
+            "name, or --force to replace it"
+        )
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:

@@ -6,17 +6,24 @@ of the picture, as ``fixed`` converts them.
 
 from __future__ import annotations
 
+import struct
+import zlib
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from cvo_edge.files import SOFTWARE, write_whole
 
 Colour = tuple[int, int, int]
 
 SCALE, BITS = 2, 4
 TEXT: Colour = (60, 60, 60)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+# Signature and the chunk IHDR.
+_PNG_HEAD = 33
 _SAMPLE = "truth inside in 50 of 50 frames"
 
 
@@ -86,3 +93,12 @@ def draw_text(
 def _character_width(thickness: int) -> float:
     """Return the mean width of a character at scale 1, in pixels."""
     return float(cv2.getTextSize(_SAMPLE, _FONT, 1.0, thickness)[0][0]) / len(_SAMPLE)
+
+
+def write_png(path: str | Path, picture: NDArray[np.uint8]) -> None:
+    """Write a picture as PNG; raises SinkError if the file cannot be written."""
+    encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+    # PNG, section 11.3.3: a chunk is its length, kind, data and checksum.
+    text = b"tEXtSoftware\0" + SOFTWARE.encode()
+    chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    write_whole(Path(path), encoded[:_PNG_HEAD] + chunk + encoded[_PNG_HEAD:])

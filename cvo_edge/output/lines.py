@@ -12,15 +12,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from cvo_edge.errors import SinkError, UsageError
+from cvo_edge.errors import SinkError
+from cvo_edge.files import check_output
 from cvo_edge.vocabulary import Existing
 
 # Set by SIGHUP: every file is opened again before its next line.
 _reopening = 0
-# A file of this program says so in its beginning.
-# Files of older versions, and tables, say it in other words.
-_BEGINNING, _MARK = 4096, b"cvo-edge"
-_OTHER_BEGINNINGS = (b'{"seq":', b"seq,stamp_ns,", b"Position and half the width")
+_BLOCK = 4096
 
 
 def reopen_files() -> None:
@@ -30,23 +28,6 @@ def reopen_files() -> None:
     """
     global _reopening
     _reopening += 1
-
-
-def refuse_foreign(path: str) -> None:
-    """Raise UsageError if a file exists that this program did not write, and is not empty."""
-    try:
-        with Path(path).open("rb", buffering=0) as stream:
-            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
-                return
-            beginning = stream.read(_BEGINNING)
-    except OSError:
-        # None there, or one that opening it for writing judges.
-        return
-    if beginning and _MARK not in beginning and not beginning.startswith(_OTHER_BEGINNINGS):
-        raise UsageError(
-            f"{path}: expected a new file or one of cvo-edge, found another one; choose another "
-            "name, or --force to replace it"
-        )
 
 
 class LineFile:
@@ -85,8 +66,7 @@ class LineFile:
         self._existing, self._told = existing, told
         self._started = False
         self._opened = _reopening
-        if self._owned and existing != "force":
-            refuse_foreign(path)
+        check_output(path, force=existing == "force")
         try:
             self._descriptor = _opened(path) if self._owned else sys.stdout.fileno()
             self._alone()
@@ -216,7 +196,7 @@ def _end_of_lines(path: str) -> int:
     with Path(path).open("rb") as stream:
         end = stream.seek(0, os.SEEK_END)
         while end > 0:
-            begin = max(0, end - _BEGINNING)
+            begin = max(0, end - _BLOCK)
             stream.seek(begin)
             found = stream.read(end - begin).rfind(b"\n")
             if found >= 0:

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from cvo_edge.errors import UsageError
 from cvo_edge.estimate import PoseInterval
-from cvo_edge.output.lines import refuse_foreign
+from cvo_edge.files import check_output
 from cvo_edge.output.messages import Placement
 from cvo_edge.output.records import Header
 from cvo_edge.output.sinks import Sink
@@ -45,8 +45,7 @@ def open_sink(
 
         if region:
             raise UsageError("region: expected the format jsonl, found mcap")
-        if existing == "replace":
-            refuse_foreign(path)
+        check_output(path, force=existing == "force")
         return McapSink(path, header, placement or Placement.of(header))
     if placement is not None:
         raise UsageError(

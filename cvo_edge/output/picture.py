@@ -6,14 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cvo_edge.errors import SinkError, UsageError
+from cvo_edge.errors import UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.output.drawing import (
     BITS,
@@ -152,17 +151,6 @@ def draw_run(
     picture = cv2.resize(canvas, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
     # 32 levels per channel look the same and reduce the file by a third.
     return np.asarray(picture // 8 * 8 + picture // 32, np.uint8)
-
-
-def write_png(path: str | Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture as PNG; raises SinkError if the file cannot be written."""
-    encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
-    try:
-        Path(path).write_bytes(encoded.tobytes())
-    # A ValueError means that the name is not a valid file name.
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", error)
-        raise SinkError(f"{path}: cannot be written: {reason}") from None
 
 
 def _compared(

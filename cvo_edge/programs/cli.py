@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from cvo_edge.errors import GateError, UsageError
-from cvo_edge.files import refuse_overwriting, write_text
+from cvo_edge.files import check_output, write_report
 from cvo_edge.process import guarded
 from cvo_edge.programs.convert import (
     convert,
@@ -20,6 +20,7 @@ from cvo_edge.programs.odometry import odometry
 from cvo_edge.programs.options import (
     BundleArgument,
     CacheOption,
+    ForceOption,
     JsonFileOption,
     JsonOption,
     ThreadsOption,
@@ -55,10 +56,12 @@ def demonstrate(
     picture: Annotated[Path, typer.Option(help="PNG file to write.", readable=False)] = Path(
         "cvo-edge-demo.png"
     ),
+    force: ForceOption = False,
 ) -> None:
     """Run a bundle on the packaged clip, compare it with the ground truth and draw a picture."""
     from cvo_edge.programs.demo import BUNDLE, demo
 
+    check_output(picture, force=force)
     demo(bundle or BUNDLE, picture)
 
 
@@ -93,6 +96,7 @@ def bench(
     threads: ThreadsOption = None,
     cache: CacheOption = True,
     json_file: JsonFileOption = None,
+    force: ForceOption = False,
     max_p95_ms: Annotated[
         float | None,
         typer.Option(help="Exit 8 if the total's p95 is longer.", rich_help_panel="Gates"),
@@ -106,7 +110,7 @@ def bench(
     from cvo_edge.programs.bench import benchmark, benchmark_lines
 
     if json_file is not None:
-        refuse_overwriting(json_file, source, bundle)
+        check_output(json_file, source, bundle, force=force)
     report = benchmark(
         bundle,
         source,
@@ -117,7 +121,7 @@ def bench(
         cache=model_cache(cache),
     )
     if json_file is not None:
-        write_text(json_file, json.dumps(report, indent=1) + "\n")
+        write_report(json_file, report)
     if json_file != "-":
         print(*benchmark_lines(report), sep="\n")
     p95, rss = report["latency_ms"]["total"]["p95"], report["memory_mib"]["peak_rss"]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
+from cvo_edge.files import whole_path
 from cvo_edge.output.mcap import McapSink, recover
 from cvo_edge.output.messages import Message, Placement, ros_image
 from cvo_edge.output.opening import open_sink
@@ -75,7 +76,10 @@ def convert(
     placement = placement_of(header, base, map, frame_id, child_frame_id, unknown_variance)
     if images is not None and format != "mcap":
         raise UsageError(f"--images: expected the format mcap, found {format}")
-    with open_sink(output, format, header, placement) as sink:
+    with (
+        whole_path(output) as name,
+        open_sink(name, format, header, placement, existing="force") as sink,
+    ):
         count = 0
         for estimate in _estimates(source, header):
             if images is not None and isinstance(sink, McapSink):
@@ -114,6 +118,7 @@ def _image(estimate: PoseInterval, images: Path, placement: Placement) -> Iterat
 
 def recovered(source: Path, output: str) -> str:
     """Finish a file that was not; returns the line that says what was found."""
-    found = recover(source, output)
+    with whole_path(output) as name:
+        found = recover(source, name)
     state = "was finished" if found.finished else "was not finished"
     return f"{source} {state}; {found.messages} complete messages -> {output}"

@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from cvo_edge.errors import UsageError
-from cvo_edge.files import refuse_overwriting
+from cvo_edge.files import check_output
 from cvo_edge.process import say
+from cvo_edge.programs.options import ForceOption
 from cvo_edge.vocabulary import Format
 
 FRAMES = "Frames (mcap)"
@@ -93,6 +94,7 @@ def convert(
         bool,
         typer.Option("--recover", help="Finish an MCAP file whose writer was killed."),
     ] = False,
+    force: ForceOption = False,
     base: BaseOption = None,
     map: MapOption = None,
     frame_id: FrameIdOption = None,
@@ -103,7 +105,7 @@ def convert(
     from cvo_edge.output.sinks import format_of
     from cvo_edge.programs import conversion
 
-    refuse_overwriting(output, source)
+    check_output(output, source, force=force)
     written_as = format_of(output, format)
     frames = (base, map, frame_id, child_frame_id, unknown_variance)
     if recover:

@@ -19,7 +19,8 @@ from cvo_edge.ground_truth import GroundTruth, open_ground_truth
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
-from cvo_edge.output.picture import Span, draw_run, write_png
+from cvo_edge.output.drawing import write_png
+from cvo_edge.output.picture import Span, draw_run
 from cvo_edge.output.sinks import Sink
 from cvo_edge.programs.hand import HAND, covered
 from cvo_edge.programs.run import RunSummary, run

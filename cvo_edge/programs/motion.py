@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cvo_edge.errors import GateError, UsageError
-from cvo_edge.files import refuse_overwriting, write_text
+from cvo_edge.files import check_output, write_report
 from cvo_edge.programs.options import (
     INTERVALS,
     REPORT,
@@ -119,6 +118,7 @@ def conformalize(
     output: Annotated[
         str, typer.Option("-o", "--output", help="File to write, or - for stdout.")
     ] = "motion.json",
+    force: ForceOption = False,
     name: Annotated[
         str, typer.Option(help="Estimator and vehicle, shown in reports.")
     ] = "estimator",
@@ -183,7 +183,7 @@ def conformalize(
         )
     given = listed_files(files or [], pairs, group or [])
     read = [path for each in given for path in each.paths]
-    refuse_overwriting(output, *read, pairs, times)
+    check_output(output, *read, pairs, times, force=force)
     calibrate(
         given,
         Reading(format, times, fps),
@@ -285,10 +285,10 @@ def annotate(
         if anchors is not None:
             raise UsageError("--anchors: expected a file of poses, found standard input")
         Reading(None, times, fps).check_used(timed=False)
-        refuse_overwriting(output, motion)
+        check_output(output, motion, force=force)
         annotate_stream(calibration, level, output, existing, written_as, covariance)
         return
-    refuse_overwriting(output, estimate, motion, times, anchors)
+    check_output(output, estimate, motion, times, anchors, force=force)
     poses = Reading(None, times, fps).one(Path(estimate))
     annotate_file(calibration, level, poses, output, existing, written_as, anchors, covariance)
 
@@ -312,6 +312,7 @@ def audit(
     fps: RateOption = None,
     correct: CorrectOption = None,
     json_file: JsonFileOption = None,
+    force: ForceOption = False,
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -359,7 +360,7 @@ def audit(
     others: list[Path | str | None] = [motion, pairs, times]
     for written in (json_file, picture):
         if written is not None:
-            refuse_overwriting(str(written), *read, *others)
+            check_output(written, *read, *others, force=force)
             others.append(written)
     pairs_read = read_pairs(named, Reading(format, times, fps)).pairs
     if wanted:
@@ -374,7 +375,7 @@ def audit(
 
         draw_audit(picture, calibration, level, found, report)
     if json_file is not None:
-        write_text(json_file, json.dumps(msgspec.to_builtins(report), indent=1) + "\n")
+        write_report(json_file, msgspec.to_builtins(report))
     try:
         if json_file != "-":
             print(*audit_lines(report), sep="\n", flush=True)

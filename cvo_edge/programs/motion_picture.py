@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import UsageError
-from cvo_edge.files import whole_file
+from cvo_edge.files import picture_metadata, whole_file
 from cvo_edge.motion.audit import Audit, scaled
 from cvo_edge.motion.intervals import Level, MotionCalibration, MotionWindow
 from cvo_edge.motion.pairs import Pair
@@ -59,7 +59,7 @@ def draw_audit(
     _draw_coverage(coverage, report)
     figure.suptitle(f"{calibration.file.name}: {level.confidence:g} {level.rule}, {level.scope}")
     with whole_file(path) as stream:
-        figure.savefig(stream, format="png", dpi=_DPI)
+        figure.savefig(stream, format="png", dpi=_DPI, metadata=picture_metadata(".png"))
 
 
 def _draw_path(axes: Axes, calibration: MotionCalibration, level: Level, pair: Pair) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.files import refuse_overwriting
+from cvo_edge.files import check_output
 from cvo_edge.process import say
 from cvo_edge.programs.motion import ConfidenceOption, RuleOption, ScopeOption
 from cvo_edge.programs.options import (
@@ -118,7 +118,7 @@ def odometry(
     # For so little work, threads cost more processor time than they save.
     cv2.setNumThreads(1)
     written_as = _format_of(output, format)
-    refuse_overwriting(output, source, camera, scale, stamps, motion)
+    check_output(output, source, camera, scale, stamps, motion, force=force)
     calibrated = checked_camera(read_camera(camera))
     tracker = _tracker(motion, written_as, scale, confidence, rule, scope)
     lengths = None if scale is None else _lengths(scale, fps)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.files import refuse_overwriting
+from cvo_edge.files import check_output
 from cvo_edge.process import say
 from cvo_edge.programs.convert import (
     BaseOption,
@@ -150,8 +150,9 @@ def run(
         raise UsageError("--label-delay: expected --labels FILE with it, found no labels")
     written_as = format_of(output, format)
     existing = existing_file(append, force, written_as)
+    named = (*named_files(ground_truth), *named_files(labels))
     read = (source, bundle, public_key, camera, state, stamps)
-    refuse_overwriting(output, *read, *named_files(ground_truth), *named_files(labels))
+    check_output(output, *read, *named, force=force)
     truth = None if ground_truth is None else open_ground_truth(ground_truth, source)
     labelled = None if labels is None else open_ground_truth(labels, source)
     frames = open_source(source, fps, timeout, stamps)

@@ -16,7 +16,7 @@ from cvo_edge.bundle.format import Calibration, StillDof
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
-from cvo_edge.files import whole_file
+from cvo_edge.files import picture_metadata, whole_file
 from cvo_edge.guarantee import statement
 from cvo_edge.input.frame import Frame
 from cvo_edge.odometer import Odometer
@@ -24,6 +24,7 @@ from cvo_edge.pose import Chart
 from cvo_edge.record import Status
 from cvo_edge.vocabulary import Scope
 from cvo_export.datasets import PoseDataset
+from cvo_export.datasets.picture import check_picture
 from cvo_export.evaluate import subset_indices
 from cvo_export.vocabulary import Subset
 
@@ -73,18 +74,9 @@ def plot(
     SinkError
         The figure cannot be written.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise UsageError(
-            'plot: matplotlib is not installed; pip install "cvo-export[plot]"'
-        ) from None
-    known = FigureCanvasAgg(Figure()).get_supported_filetypes()
-    if out.suffix[1:].lower() not in known or out.is_dir():
-        raise UsageError(
-            f"out: expected a file name ending in .{', .'.join(sorted(known))}, found {out}"
-        )
+    check_picture(out, "out")
+    from matplotlib.figure import Figure
+
     drawn = track(bundle_dir, dataset, subset, sequence, confidence, scope)
     figure = Figure(figsize=(15, 11), layout="constrained")
     grid = figure.add_gridspec(3, 3)
@@ -99,7 +91,9 @@ def plot(
         + (f", {sequence}" if sequence else "")
     )
     with whole_file(out) as stream:
-        figure.savefig(stream, format=out.suffix[1:], dpi=_DPI)
+        figure.savefig(
+            stream, format=out.suffix[1:].lower(), dpi=_DPI, metadata=picture_metadata(out.suffix)
+        )
 
 
 class Track(NamedTuple):

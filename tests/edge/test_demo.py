@@ -20,7 +20,8 @@ from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
-from cvo_edge.output.picture import HEIGHT, WIDTH, Span, draw_run, write_png
+from cvo_edge.output.drawing import write_png
+from cvo_edge.output.picture import HEIGHT, WIDTH, Span, draw_run
 from cvo_edge.pose import Chart, Pose
 from cvo_edge.programs.demo import EXPECTED, PACKAGED, demo, expected_coverage, what_happened
 from cvo_edge.programs.hand import HAND, covered, with_hand

@@ -245,11 +245,11 @@ def test_a_suffix_that_contradicts_the_format_is_refused(name, format):
 
 def test_an_old_file_is_kept_until_there_is_a_line_to_put_in_its_place(tmp_path, estimates):
     path = tmp_path / "a.txt"
-    path.write_text("# software: cvo-edge\n" * 9)
+    path.write_text("# software: cvo-edge 0\n" * 9)
     unstamped = dataclasses.replace(estimates[0], stamp_ns=None)
     with Sink(str(path), "tum") as sink, pytest.raises(UsageError):
         sink.write(unstamped)
-    assert path.read_text() == "# software: cvo-edge\n" * 9
+    assert path.read_text() == "# software: cvo-edge 0\n" * 9
     assert len(write(path, "jsonl", estimates).splitlines()) == len(estimates)
 
 

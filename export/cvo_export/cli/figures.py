@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cvo_edge.errors import UsageError
-from cvo_edge.files import write_text
-from cvo_edge.programs.options import examples
+from cvo_edge.files import check_output, write_report
+from cvo_edge.programs.options import ForceOption, examples
 from cvo_edge.vocabulary import Scope
 from cvo_export.cli.app import DatasetArgument, app, opened
 from cvo_export.vocabulary import Subset
@@ -61,6 +60,7 @@ def evaluate(
     json_file: Annotated[
         str | None, typer.Option("--json", help="Write the report as JSON to a file or -.")
     ] = None,
+    force: ForceOption = False,
     min_coverage: Annotated[
         float | None,
         typer.Option(min=0, max=1, help="Exit 8 if any DoF covers less at 0.9 marginal."),
@@ -78,12 +78,14 @@ def evaluate(
     from cvo_export.evaluate import check_coverage, table
     from cvo_export.evaluate import evaluate as evaluate_bundle
 
+    if json_file is not None:
+        check_output(json_file, bundle, force=force)
     parsed = None if noise is None else parse_noise(noise)
     schedule = None if online is None else parse_schedule(online)
     changed = None if then is None else parse_noise(then)
     report = evaluate_bundle(bundle, opened(dataset), subset, threads, parsed, schedule, changed)
     if json_file is not None:
-        write_text(json_file, json.dumps(report, indent=1) + "\n")
+        write_report(json_file, report)
     if json_file != "-":
         print(*table(report), sep="\n")
     if min_coverage is not None:
@@ -94,7 +96,8 @@ def evaluate(
 def plot(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
     dataset: DatasetArgument,
-    out: Annotated[Path, typer.Option(help="Picture to write, e.g. bands.png.")],
+    out: Annotated[Path, typer.Option(help="Picture to write: .png, .svg or .pdf.")],
+    force: ForceOption = False,
     subset: Annotated[
         Subset, typer.Option(help="The run's test frames, or all frames of unseen data.")
     ] = "test",
@@ -110,6 +113,7 @@ def plot(
     """Plot truth, point and bands of each degree of freedom, and x against y."""
     from cvo_export.plot import plot as draw
 
+    check_output(out, force=force)
     draw(
         bundle,
         opened(dataset),
@@ -154,8 +158,9 @@ def dataset(
     dataset: DatasetArgument,
     picture: Annotated[
         Path | None,
-        typer.Option(help="Draw the trajectory into a new .png, .svg or .pdf (extra [plot])."),
+        typer.Option(help="Draw the trajectory into a .png, .svg or .pdf (extra [plot])."),
     ] = None,
+    force: ForceOption = False,
 ) -> None:
     """Describe a data set, and say which splits and confidences it supports.
 
@@ -169,6 +174,7 @@ def dataset(
         _describe(dataset)
         return
     check_picture(picture, "picture")
+    check_output(picture, force=force)
     # Opened first: a picture that cannot be written is refused before any work.
     with whole_file(picture) as stream:
         found, roles = _describe(dataset)

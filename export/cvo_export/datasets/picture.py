@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cvo_edge import geometry
 from cvo_edge.errors import UsageError
+from cvo_edge.files import picture_metadata
 from cvo_export.datasets.base import PoseDataset
 from cvo_export.datasets.motion import Motion, motion_of, up_of
 
@@ -81,7 +82,7 @@ def draw(
         f"{dataset.name}: {len(dataset)} frames, path {motion.metres.sum():.1f} m"
         + (f"; up is not sure: {up.doubt}" if up.doubt else "")
     )
-    figure.savefig(stream, format=suffix[1:].lower(), dpi=_DPI)
+    figure.savefig(stream, format=suffix[1:].lower(), dpi=_DPI, metadata=picture_metadata(suffix))
 
 
 class _Direction(NamedTuple):
