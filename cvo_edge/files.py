@@ -85,6 +85,13 @@ def read_regular_file(
     return content
 
 
+def untrusted(found: os.stat_result) -> bool:
+    """Whether others than this user and root own a file or folder, or may write to it."""
+    return found.st_uid not in (os.geteuid(), 0) or bool(
+        found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    )
+
+
 @contextmanager
 def whole_file(
     path: Path, *, durable: bool = False, make_folder: bool = False

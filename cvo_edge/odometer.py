@@ -21,8 +21,9 @@ from cvo_edge.camera_check import LensEstimate
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.engine.observation import Observation, Observer
+from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.engine.session import Session
-from cvo_edge.errors import ModelError, UsageError
+from cvo_edge.errors import GateError, ModelError, UsageError
 from cvo_edge.estimate import Drift, PoseInterval
 from cvo_edge.input.clock import SYSTEM_CLOCK
 from cvo_edge.input.frame import Frame, checked_hint
@@ -136,22 +137,25 @@ class Odometer(Labelled):
         state: str | os.PathLike[str] | None = None,
         cache: ModelCache | None = None,
         public_key: str | os.PathLike[str] | None = None,
+        name: str | None = None,
     ) -> Odometer:
         """Load a bundle folder; parameters and errors are those of the class.
 
         With a cache, e.g. ``ModelCache.default()``, the model is optimised for this machine once;
         later loads need a fraction of the time and memory, and results are bit-identical. With a
-        public key (PEM, Ed25519), the bundle must be signed with that key, and older versions of it
-        are rejected from then on.
-
-        Raises the errors of ``read_bundle``, too.
+        public key (PEM, Ed25519), the bundle must be signed with that key. Once it has passed its
+        self-test (else GateError), older versions are rejected, and bundles of another name in the
+        same folder, unless ``name`` names them. Raises the errors of ``read_bundle``, too.
         """
         check = trust = None
         if public_key is not None:
             from cvo_edge.bundle.signature import Trust
 
-            trust = Trust.in_key(Path(public_key))
+            trust = Trust.in_key(Path(public_key), name)
             check = trust.check
+            cache = None if cache is None else cache.sealed(trust.record, trust.key_sha256)
+        elif name is not None:
+            raise UsageError(f"name: expected a public key with it, found none with {name}")
 
         def opened(cache: ModelCache | None) -> Odometer:
             return cls(
@@ -172,7 +176,12 @@ class Odometer(Labelled):
                 raise
             # Another process may have cleared the cache after it was read.
             odometer = opened(None)
-        if trust is not None:
+        if trust is not None and trust.is_new:
+            try:
+                check_selftest(odometer)
+            except GateError:
+                odometer.close()
+                raise
             trust.remember()
         return odometer
 

@@ -1,36 +1,35 @@
-"""Bundle signatures (Ed25519) and protection against older versions.
+"""Bundle signatures (Ed25519), and protection against older versions and exchanged bundles.
 
 Digests show that a bundle is intact, not who made it. ``signature.json`` signs the bundle's name, a
 version and the sha256 of ``calibration.json``, which contains the sha256 of the model. A device
-records the highest version that it has run of each name and rejects older ones, even if their
-signature is valid.
+records the highest version that it has run of each name, and the name of the bundle in each folder
+(``cvo_edge.bundle.device_record``). It rejects older versions, and other bundles in the same place,
+even if their signature is valid.
 
 Signatures follow RFC 8032 and need ``cryptography`` (extra ``[sign]``).
 """
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import hashlib
-import json
-from collections.abc import Iterator
+import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta, Struct
 
+from cvo_edge.bundle.device_record import DeviceRecord
 from cvo_edge.bundle.format import Calibration, Sha256, Text
-from cvo_edge.errors import BundleMismatchError, SinkError, UsageError
-from cvo_edge.files import own_folder, read_regular_file, write_whole
+from cvo_edge.errors import BundleMismatchError, UsageError
+from cvo_edge.files import read_regular_file
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 SIGNATURE_FILE = "signature.json"
-STATE_VARIABLE = "CVO_EDGE_STATE"
 _MAX_SIGNATURE_BYTES = 4096
 MAX_KEY_BYTES = 16384
 _UNDECODABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
@@ -58,24 +57,34 @@ def message(name: str, version: int, calibration_sha256: str) -> bytes:
     return f"cvo-edge bundle 1\n{name}\n{version}\n{calibration_sha256}\n".encode()
 
 
+class Accepted(NamedTuple):
+    """A bundle whose signature is valid: its name, its version, and the folder that it is in."""
+
+    name: str
+    version: int
+    folder: str
+
+
 @dataclass
 class Trust:
-    """Accept bundles that are signed with one key and not older than those this device has run.
+    """Accept bundles that are signed with one key, and are what this device has run before.
 
-    ``accepted`` is the name and version of the bundle that was checked last.
+    ``name`` is the name that a bundle must have; None stands for the one that this device has run
+    from the same folder, if it has. ``accepted`` is the bundle that was checked last.
     """
 
     key: Ed25519PublicKey
-    versions: Versions
-    accepted: tuple[str, int] | None = None
+    record: DeviceRecord
+    name: str | None = None
+    accepted: Accepted | None = None
 
     @classmethod
-    def in_key(cls, path: Path) -> Trust:
-        """Read a public key from a PEM file, and use this device's record of versions.
+    def in_key(cls, path: Path, name: str | None = None) -> Trust:
+        """Read a public key from a PEM file, and use this device's record.
 
         Raises UsageError if it is not an Ed25519 key or ``cryptography`` is not installed.
         """
-        return cls(_public_key(path), Versions.default())
+        return cls(_public_key(path), DeviceRecord.default(), name)
 
     @property
     def key_sha256(self) -> str:
@@ -86,7 +95,8 @@ class Trust:
         """Check a bundle's signature and version; ``content`` holds its ``calibration.json``.
 
         Raises BundleMismatchError if the bundle is not signed, was altered after signing, is signed
-        with another key, or is older than a version that this device has run.
+        with another key, has another name than expected, or is older than a version that this
+        device has run.
         """
         from cryptography.exceptions import InvalidSignature
 
@@ -110,89 +120,48 @@ class Trust:
             raise BundleMismatchError(
                 f"{path}: the signature is not valid for {name} version {signature.version}"
             ) from None
-        highest = self.versions.highest(self.key_sha256, name)
+        # Not resolved: devices change bundles by a link in the same place.
+        place = os.path.abspath(folder)  # noqa: PTH100
+        self._check_name(path, place, name)
+        highest = self.record.highest(self.key_sha256, name)
         if signature.version < highest:
             raise BundleMismatchError(
                 f"{path}: expected version {highest} or later of {name}, because this device has "
                 f"run version {highest}, found {signature.version}"
             )
-        self.accepted = name, signature.version
+        self.accepted = Accepted(name, signature.version, place)
+
+    def _check_name(self, path: Path, place: str, name: str) -> None:
+        """Check that the bundle is the one meant: the key may have signed others, too."""
+        if self.name is not None:
+            if self.name != name:
+                raise BundleMismatchError(f"{path}: expected the bundle {self.name}, found {name}")
+            return
+        known = self.record.name_in(self.key_sha256, place)
+        if known not in (None, name):
+            raise BundleMismatchError(
+                f"{path}: expected {known}, which this device has run from this folder, found "
+                f"{name}; if that is meant, give --name {shlex.quote(name)} once"
+            )
+
+    @property
+    def is_new(self) -> bool:
+        """Whether this device has not run the accepted version from its folder yet."""
+        if self.accepted is None:
+            return False
+        name, version, folder = self.accepted
+        key = self.key_sha256
+        return version > self.record.highest(key, name) or self.record.name_in(key, folder) != name
 
     def remember(self) -> None:
-        """Record the accepted version, so that older ones are rejected from now on.
+        """Record the accepted bundle, so that older versions and others are rejected from now on.
 
         Raises SinkError if the record cannot be written.
         """
         if self.accepted is not None:
-            self.versions.raise_to(self.key_sha256, *self.accepted)
-
-
-@dataclass(frozen=True)
-class Versions:
-    """Record of the highest version that this device has run, by key and bundle name."""
-
-    path: Path
-
-    @classmethod
-    def default(cls) -> Versions:
-        """Use ``versions.json`` in ``$CVO_EDGE_STATE``, or in the user's XDG state folder.
-
-        Raises UsageError if the variable holds a relative path.
-        """
-        folder = own_folder(STATE_VARIABLE, "XDG_STATE_HOME", "~/.local/state")
-        return cls(folder / "versions.json")
-
-    def highest(self, key: str, name: str) -> int:
-        """Return the highest version that this device has run, or 0.
-
-        Raises BundleMismatchError if the file exists but is damaged: ignoring it would let older
-        versions run again.
-        """
-        return self._read().get(key, {}).get(name, 0)
-
-    def raise_to(self, key: str, name: str, version: int) -> None:
-        """Record a version, unless a higher one is recorded; raises SinkError on failure."""
-        if version <= self.highest(key, name):
-            return
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self._alone():
-                known = self._read()
-                of_key = known.setdefault(key, {})
-                of_key[name] = max(version, of_key.get(name, 0))
-                self._write(known)
-        except OSError as error:
-            raise SinkError(
-                f"{self.path}: cannot record the bundle's version: {error.strerror}"
-            ) from None
-
-    @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
-        """Lock out other processes during an update; the lock ends with the process."""
-        with (self.path.parent / "versions.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
-
-    def _read(self) -> dict[str, dict[str, int]]:
-        try:
-            content = self.path.read_bytes()
-        except FileNotFoundError:
-            return {}
-        except OSError as error:
-            raise BundleMismatchError(
-                f"{self.path}: cannot read the versions that this device has run: {error.strerror}"
-            ) from None
-        try:
-            return msgspec.json.decode(content, type=dict[str, dict[str, int]])
-        except _UNDECODABLE:
-            raise BundleMismatchError(
-                f"{self.path}: the record of versions that this device has run is damaged; if you "
-                "delete it, older versions are accepted again"
-            ) from None
-
-    def _write(self, known: dict[str, dict[str, int]]) -> None:
-        """Replace the file atomically, even if the power fails."""
-        write_whole(self.path, json.dumps(known, indent=1), durable=True)
+            name, version, folder = self.accepted
+            self.record.raise_to(self.key_sha256, name, version)
+            self.record.keep_name(self.key_sha256, folder, name)
 
 
 def _read_signature(path: Path) -> Signature:

@@ -3,7 +3,8 @@
 Loading a model means parsing it, optimising its graph for this processor and rearranging its
 weights. The cache stores the result as a folder of two files: the optimised graph, and its weights,
 which the system maps into memory and shares between processes. An entry belongs to one model, one
-release of onnxruntime and one processor, and is used only if its bytes are unchanged.
+release of onnxruntime and one processor, and is used only if its bytes are unchanged. Nobody but
+this user and root may be able to write to it, because digests in an entry can be made to match.
 
 A failure of the cache never stops a model from running: it only makes the start slower.
 """
@@ -28,8 +29,9 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from cvo_edge.errors import SinkError
-from cvo_edge.files import own_folder, write_whole
+from cvo_edge.bundle.device_record import DeviceRecord
+from cvo_edge.errors import BundleMismatchError, SinkError
+from cvo_edge.files import own_folder, untrusted, write_whole
 
 GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
 SEEN_FILE = "seen.json"
@@ -104,6 +106,7 @@ class ModelCache:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
+        self._seal: tuple[DeviceRecord, str] | None = None
 
     @classmethod
     def default(cls) -> ModelCache:
@@ -113,13 +116,28 @@ class ModelCache:
         """
         return cls(own_folder(CACHE_VARIABLE, "XDG_CACHE_HOME", "~/.cache"))
 
+    def sealed(self, record: DeviceRecord, key: str) -> ModelCache:
+        """Return the same cache, of entries only that this device made of models with this key.
+
+        A signature covers a model's own bytes. ``record`` keeps what became of them here, so that
+        whoever can write to the cache alone changes nothing that runs.
+        """
+        cache = ModelCache(self.folder)
+        cache._seal = record, key
+        return cache
+
     def find(self, model_sha256: str) -> CachedModel | None:
         """Return the entry of a model, or None; a changed entry is removed."""
         if self.obstacle() is not None:
             return None
         folder = self._entry_folder(model_sha256)
         try:
-            entry = msgspec.json.decode(_content(folder / ENTRY_FILE), type=Entry)
+            if untrusted(folder.lstat()):
+                raise _not_ours(folder)
+            stated = _content(folder / ENTRY_FILE)
+            if not self._is_sealed(model_sha256, stated):
+                return None
+            entry = msgspec.json.decode(stated, type=Entry)
             graph = _content(folder / GRAPH_FILE)
             unchanged = (
                 (entry.model_sha256, entry.onnxruntime, entry.processor)
@@ -156,7 +174,7 @@ class ModelCache:
         """Create a folder for the files of a new entry; None if that is impossible."""
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if self.obstacle() is not None:
+            if self.obstacle(writing=True) is not None:
                 return None
             self._sweep()
             return Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=self.folder))
@@ -177,10 +195,17 @@ class ModelCache:
                 graph_sha256=hashlib.sha256((new / GRAPH_FILE).read_bytes()).hexdigest(),
                 weights_sha256=file_digests(new / WEIGHTS_FILE),
             )
-            (new / ENTRY_FILE).write_bytes(msgspec.json.encode(entry))
+            stated = msgspec.json.encode(entry)
+            (new / ENTRY_FILE).write_bytes(stated)
+            if self._seal is not None:
+                # An entry that was found without its seal is not used, and would be in the way.
+                self.forget(model_sha256)
+                digest = hashlib.sha256(stated).hexdigest()
+                record, key = self._seal
+                record.keep_prepared(key, model_sha256, digest)
             # The rename is atomic and fails if the entry already exists.
             new.rename(self._entry_folder(model_sha256))
-        except OSError:
+        except (OSError, SinkError, BundleMismatchError):
             pass
         finally:
             self.discard(new)
@@ -223,8 +248,11 @@ class ModelCache:
             count += not folder.name.startswith(_UNFINISHED) and not folder.exists()
         return count
 
-    def obstacle(self) -> str | None:
-        """Return why this cache cannot be used, or None if it can."""
+    def obstacle(self, *, writing: bool = False) -> str | None:
+        """Return why this cache cannot be used, or None if it can.
+
+        ``writing``: for new entries, too. A folder that was filled before may be read-only.
+        """
         try:
             found = self.folder.stat()
         except FileNotFoundError:
@@ -233,11 +261,20 @@ class ModelCache:
             return f"cannot be read: {error.strerror}"
         if not stat.S_ISDIR(found.st_mode):
             return "not a folder"
-        if found.st_uid != os.getuid() or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-            return "must belong to this user and be writable only by this user"
-        if not os.access(self.folder, os.R_OK | os.W_OK | os.X_OK):
-            return "no permission to read from and write to this folder"
+        if untrusted(found):
+            return "must belong to this user or root and be writable only by its owner"
+        if not os.access(self.folder, os.R_OK | os.X_OK):
+            return "no permission to read from this folder"
+        if writing and not os.access(self.folder, os.W_OK):
+            return "no permission to write to this folder"
         return None
+
+    def _is_sealed(self, model_sha256: str, stated: bytes) -> bool:
+        """Whether this cache may use the entry with this ``entry.json``."""
+        if self._seal is None:
+            return True
+        record, key = self._seal
+        return record.prepared(key, model_sha256) == hashlib.sha256(stated).hexdigest()
 
     def _folders(self) -> list[Path]:
         """Return only folders that the cache created: the folder may hold other files, too."""
@@ -297,12 +334,19 @@ def _seen(cached: CachedModel) -> list[FileIdentity]:
 
 
 def _opened(path: Path) -> io.FileIO:
-    """Open a regular file, without following links or waiting for pipes."""
+    """Open a regular file that others cannot write to, without following links or waiting."""
     stream = io.FileIO(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK))
-    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
-        stream.close()
-        raise FileNotFoundError(errno.ENOENT, "expected a regular file", str(path))
-    return stream
+    found = os.fstat(stream.fileno())
+    if stat.S_ISREG(found.st_mode) and not untrusted(found):
+        return stream
+    stream.close()
+    if stat.S_ISREG(found.st_mode):
+        raise _not_ours(path)
+    raise FileNotFoundError(errno.ENOENT, "expected a regular file", str(path))
+
+
+def _not_ours(path: Path) -> PermissionError:
+    return PermissionError(errno.EPERM, "other users may write to it", str(path))
 
 
 def _content(path: Path) -> bytes:

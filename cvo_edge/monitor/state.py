@@ -143,7 +143,8 @@ class StateFile:
         path = self.path.with_name(f"{self.path.name}.lock")
         while self._release is None:
             try:
-                descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+                # Private: any user who can open the file could hold the lock.
+                descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             except OSError:
                 return  # nothing can be written here either, and the first write says so
             try:

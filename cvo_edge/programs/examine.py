@@ -8,13 +8,20 @@ from typing import Annotated, Literal
 import typer
 
 from cvo_edge.errors import SinkError
-from cvo_edge.programs.options import BundleArgument, JsonOption, PublicKeyOption, ThreadsOption
+from cvo_edge.programs.options import (
+    BundleArgument,
+    JsonOption,
+    NameOption,
+    PublicKeyOption,
+    ThreadsOption,
+)
 
 
 def verify(
     bundle: BundleArgument,
     threads: ThreadsOption = None,
     public_key: PublicKeyOption = None,
+    name: NameOption = None,
     timeout: Annotated[
         float, typer.Option(help="Seconds allowed for loading and self-test.")
     ] = 60.0,
@@ -26,7 +33,9 @@ def verify(
     """
     from cvo_edge.programs.verify import verify_bundle
 
-    verdict = verify_bundle(bundle, threads=threads, timeout_s=timeout, public_key=public_key)
+    verdict = verify_bundle(
+        bundle, threads=threads, timeout_s=timeout, public_key=public_key, name=name
+    )
     print(verdict.line())
 
 
@@ -80,7 +89,7 @@ def cache(
 
     found = ModelCache.default()
     if clear:
-        obstacle = found.obstacle()
+        obstacle = found.obstacle(writing=True)
         if obstacle is not None:
             raise SinkError(f"{found.folder}: {obstacle}")
         removed = found.clear()

@@ -60,6 +60,16 @@ PublicKeyOption = Annotated[
         rich_help_panel=RUNTIME,
     ),
 ]
+NameOption = Annotated[
+    str | None,
+    typer.Option(
+        "--name",
+        help="With --public-key: the bundle's name; default: that of the first bundle that this "
+        "device has run from the folder.",
+        show_default=False,
+        rich_help_panel=RUNTIME,
+    ),
+]
 CameraOption = Annotated[
     Path | None,
     typer.Option(

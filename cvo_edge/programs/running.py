@@ -34,6 +34,7 @@ from cvo_edge.programs.options import (
     LabelsOption,
     MaxFramesOption,
     ModeOption,
+    NameOption,
     OutputOption,
     PublicKeyOption,
     RegionOption,
@@ -121,6 +122,7 @@ def run(
     threads: ThreadsOption = None,
     cache: CacheOption = True,
     public_key: PublicKeyOption = None,
+    name: NameOption = None,
     mavlink: MavlinkOption = None,
     metrics: MetricsOption = None,
     base: BaseOption = None,
@@ -167,6 +169,7 @@ def run(
         state=state,
         cache=model_cache(cache),
         public_key=public_key,
+        name=name,
     ) as odometer:
         if region and not odometer.has_region:
             raise UsageError(

@@ -64,12 +64,13 @@ def verify_bundle(
     threads: int | None = None,
     timeout_s: float = TIMEOUT_S,
     public_key: Path | None = None,
+    name: str | None = None,
 ) -> Verdict:
     """Check a bundle's digests and numbers, load it and run its self-test, in a child process.
 
     The self-test runs on the model itself and, if the cache holds one, on its cached form. With
-    a public key, the signature and the version are checked, too: the version must not be older than
-    one that this device has run.
+    a public key, signature, name and version are checked, too, as ``Odometer.load`` does; nothing
+    is recorded.
 
     Raises
     ------
@@ -97,6 +98,7 @@ def verify_bundle(
             "threads": threads,
             "timeout_s": timeout_s,
             "public_key": None if public_key is None else str(public_key),
+            "name": name,
         }
         with signals_deferred():
             try:
@@ -162,26 +164,33 @@ def child() -> None:
 
 
 def _selftest(
-    folder: str, threads: int | None, timeout_s: float, public_key: str | None
+    folder: str,
+    threads: int | None,
+    timeout_s: float,
+    public_key: str | None,
+    name: str | None,
 ) -> Verdict:
     from cvo_edge.engine.cores import checked_threads
     from cvo_edge.engine.loading import Bundle, cached_model, read_bundle
     from cvo_edge.engine.model_cache import ModelCache
+    from cvo_edge.engine.selftest import check_reaction, check_selftest
     from cvo_edge.heads.plausible import check_plausible
     from cvo_edge.odometer import Odometer
-    from cvo_edge.programs.selftest import check_reaction, check_selftest
 
-    check = None
+    check, cache = None, ModelCache.default()
     if public_key is not None:
         from cvo_edge.bundle.signature import Trust
 
-        check = Trust.in_key(Path(public_key)).check
+        trust = Trust.in_key(Path(public_key), name)
+        check, cache = trust.check, cache.sealed(trust.record, trust.key_sha256)
+    elif name is not None:
+        raise UsageError(f"name: expected a public key with it, found none with {name}")
     bundle = read_bundle(folder, check=check)
     calibration = bundle.calibration
     _limit(len(bundle.model_bytes), checked_threads(threads), timeout_s)
     check_plausible(calibration, bundle.head)
     forms = [bundle]
-    cached = cached_model(ModelCache.default(), calibration)
+    cached = cached_model(cache, calibration)
     if cached is not None:
         forms.append(Bundle(calibration, bundle.head, cached))
     first, worst = calibration.thresholds[0], 0.0

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from cvo_edge import Odometer, open_source
+from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.errors import GateError
 from cvo_edge.ground_truth import open_ground_truth
 from cvo_edge.pose_solver import PoseSolver
-from cvo_edge.programs.selftest import check_selftest
 
 ARTIFACTS = Path(__file__).resolve().parents[2] / "calibration_artifacts"
 METHODS = ["scr", "cjp", "cqr", "csp", "mcqr"]

@@ -23,12 +23,13 @@ from cvo_edge.engine.model_cache import (
     ModelCache,
     file_digests,
 )
+from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
+from cvo_edge.files import untrusted
 from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.inspect import cache_lines
-from cvo_edge.programs.selftest import check_selftest
 
 CVO_EDGE = [sys.executable, "-c", "from cvo_edge.__main__ import main; main()"]
 
@@ -344,8 +345,44 @@ def test_the_list_says_why_a_cache_is_not_used(bundle_dir, cache):
     read_bundle(bundle_dir, cache=cache)
     assert cache.obstacle() is None
     cache.folder.chmod(0o775)
-    assert "writable only by this user" in (cache.obstacle() or "")
+    assert "writable only by its owner" in (cache.obstacle() or "")
     assert any(line.startswith("not used") for line in cache_lines(cache))
+
+
+@pytest.mark.parametrize("file", ["", GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE])
+def test_an_entry_that_others_may_write_to_is_made_anew(file, bundle_dir, bundle, cache):
+    """Whoever can write to an entry can make its digests match."""
+    read_bundle(bundle_dir, cache=cache)
+    path = entry_folder(cache) / file
+    path.chmod(0o777 if path.is_dir() else 0o664)
+    assert cache.find(bundle.calibration.model.sha256) is None
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, CachedModel)
+    assert path.stat().st_mode & 0o022 == 0
+
+
+def test_files_of_root_and_of_this_user_are_trusted_and_others_are_not(monkeypatch):
+    monkeypatch.setattr("cvo_edge.files.os.geteuid", lambda: 1000)
+
+    def found(mode: int, user: int) -> os.stat_result:
+        return os.stat_result((mode, 1, 1, 1, user, user, 0, 0, 0, 0))
+
+    trusted = [(0o100644, 1000), (0o100444, 0), (0o40755, 0)]
+    assert [untrusted(found(*each)) for each in trusted] == [False] * 3
+    others = [(0o100644, 1001), (0o100664, 1000), (0o100646, 0), (0o40777, 1000)]
+    assert [untrusted(found(*each)) for each in others] == [True] * 4
+
+
+def test_a_folder_that_was_filled_before_may_be_read_only(bundle_dir, cache, monkeypatch):
+    read_bundle(bundle_dir, cache=cache)
+
+    def readable(path, mode):
+        return mode & os.W_OK == 0
+
+    monkeypatch.setattr("cvo_edge.engine.model_cache.os.access", readable)
+    assert isinstance(read_bundle(bundle_dir, cache=cache).model, CachedModel)
+    other = bundle_dir.with_name("synthetic-room-csp")
+    assert isinstance(read_bundle(other, cache=cache).model, bytes)
+    assert len(list(cache.folder.iterdir())) == 1
 
 
 def test_the_folder_is_named_by_the_environment(monkeypatch, tmp_path):

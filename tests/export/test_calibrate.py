@@ -14,10 +14,10 @@ from cvo_edge.bundle.format import ImageSpec
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.conformal import conformal_quantile
 from cvo_edge.engine.loading import read_bundle
+from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.errors import BundleMismatchError, CvoError, ModelError, SinkError, UsageError
 from cvo_edge.geometry import mean_rotation
 from cvo_edge.programs.inspect import inspect_lines
-from cvo_edge.programs.selftest import check_selftest
 from cvo_export.bundles.observed import observe
 from cvo_export.calibrate import calibrate
 from cvo_export.cli import app

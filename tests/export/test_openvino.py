@@ -16,10 +16,10 @@ from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.engine.openvino import OpenvinoSession
+from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.errors import ModelError
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.inspect import inspect_lines
-from cvo_edge.programs.selftest import check_selftest
 from cvo_export.calibrate import calibrate
 from cvo_export.datasets import open_dataset
 from cvo_export.publish import publish

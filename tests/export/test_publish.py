@@ -15,10 +15,10 @@ from cvo_edge.bundle.format import CONFIDENCES
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.conformal import conformal_quantile
 from cvo_edge.engine.loading import read_bundle
+from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
 from cvo_edge.pose import about
-from cvo_edge.programs.selftest import check_selftest
 from cvo_export.bundles.observed import observe
 from cvo_export.graph.to_onnx import check_parity, export_onnx
 from cvo_export.networks.heads.cjp import CjpConfig, CjpLearner, CjpNetwork, CjpPrediction

@@ -12,10 +12,10 @@ from torch import nn
 from cvo_edge.conformal import conformal_quantile
 from cvo_edge.engine import session
 from cvo_edge.engine.loading import read_bundle
+from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import UsageError
 from cvo_edge.odometer import Odometer
-from cvo_edge.programs.selftest import check_selftest
 from cvo_export.bundles.observed import observe
 from cvo_export.graph.quantise import quantised
 from cvo_export.graph.to_onnx import export_onnx

@@ -1,17 +1,31 @@
 """Signatures: which bundles a device accepts or refuses, through both command lines."""
 
+import fcntl
 import json
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from msgspec.structs import replace as changed
 
-from cvo_edge import BundleMismatchError, Odometer, SinkError, UsageError
+from cvo_edge import BundleMismatchError, GateError, Odometer, SinkError, UsageError
+from cvo_edge.bundle.device_record import DeviceRecord
 from cvo_edge.bundle.format import CALIBRATION_FILE, MODEL_FILE
-from cvo_edge.bundle.signature import SIGNATURE_FILE, Versions
+from cvo_edge.bundle.signature import SIGNATURE_FILE
+from cvo_edge.engine.loading import read_bundle
+from cvo_edge.engine.model_cache import (
+    ENTRY_FILE,
+    WEIGHTS_FILE,
+    CachedModel,
+    ModelCache,
+    file_digests,
+)
+from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.programs.verify import verify_bundle
+from cvo_export.bundles.writing import check_target, write_bundle
 from cvo_export.sign import PASSPHRASE, sign
 
 pytest.importorskip("cryptography")
@@ -101,8 +115,8 @@ def test_every_altered_key_of_a_signature_is_refused(copied_bundle, keys):
         "key": "0" * 64,
         "signature": "0" * 128,
     }.items():
-        for changed in ({**content, key: value}, {k: v for k, v in content.items() if k != key}):
-            path.write_text(json.dumps(changed))
+        for other in ({**content, key: value}, {k: v for k, v in content.items() if k != key}):
+            path.write_text(json.dumps(other))
             with pytest.raises(BundleMismatchError, match=r"signature\.json"):
                 load(copied_bundle, public)
     path.write_text(json.dumps({**content, "more": 1}))
@@ -168,11 +182,11 @@ def test_a_record_of_versions_that_cannot_be_read_or_written_stops_it(copied_bun
     sign(copied_bundle, secret, 5)
     state.parent.mkdir()
     state.write_text("{")
-    with pytest.raises(BundleMismatchError, match=r"versions\.json: the record of versions"):
+    with pytest.raises(BundleMismatchError, match=r"versions\.json: the record of what"):
         load(copied_bundle, public)
     for content in (b'{"\xff": {"a": 1}}', b"[" * 100_000, b'{"a": 1}', b""):
         state.write_bytes(content)
-        with pytest.raises(BundleMismatchError, match=r"versions\.json: the record of versions"):
+        with pytest.raises(BundleMismatchError, match=r"versions\.json: the record of what"):
             load(copied_bundle, public)
     state.unlink()
     state.mkdir()
@@ -181,19 +195,126 @@ def test_a_record_of_versions_that_cannot_be_read_or_written_stops_it(copied_bun
 
 
 def test_processes_at_once_keep_the_highest(tmp_path):
-    path = tmp_path / "deep" / "versions.json"
+    folder = tmp_path / "deep" / "state"
     code = (
-        "import sys; from pathlib import Path; from cvo_edge.bundle.signature import Versions\n"
-        "versions = Versions(Path(sys.argv[1]))\n"
+        "import sys; from pathlib import Path\n"
+        "from cvo_edge.bundle.device_record import DeviceRecord\n"
+        "versions = DeviceRecord(Path(sys.argv[1]))\n"
         "for v in range(1, 100):\n"
         "    versions.raise_to('k', sys.argv[2], v); versions.raise_to('k', 'of all', v)"
     )
     names = ["a", "b", "c", "d"]
-    processes = [subprocess.Popen([sys.executable, "-c", code, path, name]) for name in names]
+    processes = [subprocess.Popen([sys.executable, "-c", code, folder, name]) for name in names]
     assert [process.wait() for process in processes] == [0] * 4
     # Without a lock, a process would overwrite entries written after it had read the file.
-    assert [Versions(path).highest("k", name) for name in (*names, "of all")] == [99] * 5
-    assert [p.name for p in path.parent.iterdir() if p.suffix not in (".json", ".lock")] == []
+    assert [DeviceRecord(folder).highest("k", name) for name in (*names, "of all")] == [99] * 5
+    assert [p.name for p in folder.iterdir() if p.suffix not in (".json", ".lock")] == []
+
+
+def test_a_lock_is_private_and_waited_for_within_a_limit(tmp_path):
+    """Whoever can open the file can hold the lock for ever."""
+    record = DeviceRecord(tmp_path / "state", patience_s=0.0)
+    record.raise_to("k", "a", 1)
+    lock = record.folder / "versions.lock"
+    assert [path.stat().st_mode & 0o077 for path in (record.folder, lock)] == [0, 0]
+    # A lock of an earlier release, which others may hold.
+    lock.chmod(0o644)
+    with lock.open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(SinkError, match=r"versions\.lock: another process has held this lock"):
+            record.raise_to("k", "a", 2)
+    record.raise_to("k", "a", 2)
+    assert record.highest("k", "a") == 2
+    assert lock.stat().st_mode & 0o077 == 0
+
+
+def test_a_record_that_others_can_write_to_proves_nothing(copied_bundle, keys, state):
+    secret, public = keys
+    sign(copied_bundle, secret, 7)
+    load(copied_bundle, public)
+    for path, mode in ((state, 0o664), (state.parent, 0o777)):
+        before = path.stat().st_mode
+        path.chmod(mode)
+        with pytest.raises(BundleMismatchError, match=rf"{path.name}: expected files that only"):
+            load(copied_bundle, public)
+        path.chmod(before)
+    load(copied_bundle, public)
+
+
+def test_another_signed_bundle_in_the_same_folder_must_be_named(
+    copied_bundle, artifacts_dir, keys, state
+):
+    secret, public = keys
+    sign(copied_bundle, secret, 7)
+    with pytest.raises(BundleMismatchError, match="expected the bundle kitchen, found synthetic-"):
+        Odometer.load(copied_bundle, public_key=public, name="kitchen")
+    load(copied_bundle, public)
+    other = artifacts_dir / "synthetic-room-cqr"
+    for file in (MODEL_FILE, CALIBRATION_FILE):
+        shutil.copy(other / file, copied_bundle)
+    sign(copied_bundle, secret, 7)
+    for refused in (load, lambda b, k: verify_bundle(b, threads=1, public_key=k)):
+        with pytest.raises(BundleMismatchError, match="expected synthetic-room-cjp, which this"):
+            refused(copied_bundle, public)
+    verify_bundle(copied_bundle, threads=1, public_key=public, name="synthetic-room-cqr")
+    Odometer.load(copied_bundle, threads=1, public_key=public, name="synthetic-room-cqr").close()
+    load(copied_bundle, public)
+    with pytest.raises(UsageError, match="name: expected a public key with it"):
+        Odometer.load(copied_bundle, name="synthetic-room-cqr")
+
+
+def test_a_version_that_fails_its_self_test_does_not_replace_the_one_before(
+    copied_bundle, rewrite, bundle, keys, state
+):
+    secret, public = keys
+    sign(copied_bundle, secret, 5)
+    load(copied_bundle, public)
+    remembered = state.read_text()
+    test = bundle.calibration.selftest
+    outputs = {name: tuple(v + 0.5 for v in values) for name, values in test.outputs.items()}
+    rewrite(changed(bundle.calibration, selftest=changed(test, outputs=outputs)))
+    sign(copied_bundle, secret, 9)
+    with pytest.raises(GateError, match="self-test: expected outputs within"):
+        load(copied_bundle, public)
+    assert state.read_text() == remembered
+    rewrite(bundle.calibration)
+    sign(copied_bundle, secret, 6)
+    load(copied_bundle, public)
+
+
+def test_with_a_key_only_what_this_device_made_of_signed_bytes_is_taken_from_the_cache(
+    copied_bundle, keys, tmp_path, state
+):
+    """Digests in the cache can be made to match other weights; those in the record cannot."""
+    secret, public = keys
+    sign(copied_bundle, secret, 5)
+    cache = ModelCache(tmp_path / "cache")
+    sealed = cache.sealed(DeviceRecord(state.parent), "key")
+    digest = read_bundle(copied_bundle, cache=cache).calibration.model.sha256
+    assert sealed.find(digest) is None
+    assert isinstance(read_bundle(copied_bundle, cache=sealed).model, CachedModel)
+    assert sealed.find(digest) is not None
+    assert cache.sealed(DeviceRecord(state.parent), "another").find(digest) is None
+    (folder,) = cache.folder.iterdir()
+    weights, entry = folder / WEIGHTS_FILE, folder / ENTRY_FILE
+    (np.fromfile(weights, np.float32) * 1.03).tofile(weights)
+    stated = {**json.loads(entry.read_bytes()), "weights_sha256": file_digests(weights)}
+    entry.write_text(json.dumps(stated))
+    assert cache.find(digest) is not None
+    assert sealed.find(digest) is None
+    # It is made anew.
+    with Odometer.load(copied_bundle, threads=1, cache=cache, public_key=public) as odometer:
+        check_selftest(odometer)
+
+
+def test_a_signed_bundle_can_be_replaced_and_loses_its_signature(copied_bundle, bundle, keys):
+    sign(copied_bundle, keys[0])
+    check_target(copied_bundle)
+    write_bundle(copied_bundle, bundle.calibration, bundle.model_bytes)
+    assert not (copied_bundle / SIGNATURE_FILE).exists()
+    (copied_bundle / "notes.txt").write_text("mine")
+    with pytest.raises(SinkError, match="found other files"):
+        check_target(copied_bundle)
 
 
 @pytest.mark.parametrize("kind", ["none", "text", "private", "another curve"])
@@ -297,5 +418,5 @@ def test_a_device_remembers_in_one_place_or_says_that_it_cannot(copied_bundle, k
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.setattr(Path, "expanduser", homeless)
-    with pytest.raises((BundleMismatchError, SinkError), match=r"versions\.json"):
+    with pytest.raises((BundleMismatchError, SinkError), match=r"(versions|names)\.json"):
         load(copied_bundle, keys[1])

@@ -27,9 +27,9 @@ from cvo_edge.conformal import (
     effective_sample_size,
     recording_cap,
 )
+from cvo_edge.engine.selftest import observe_selftest
 from cvo_edge.errors import UsageError
 from cvo_edge.heads import Candidate, Head
-from cvo_edge.programs.selftest import observe_selftest
 from cvo_edge.vocabulary import SCOPES, Joint, Rule, Scope
 from cvo_export.bundles.alarm import fitted_alarm, with_copies
 from cvo_export.bundles.choice import chosen, with_difficulty

@@ -8,17 +8,20 @@ from pathlib import Path
 
 from cvo_edge.bundle.format import CALIBRATION_FILE, MODEL_FILE, Calibration
 from cvo_edge.bundle.reading import encode_calibration, read_calibration
+from cvo_edge.bundle.signature import SIGNATURE_FILE
+from cvo_edge.engine.selftest import check_reaction, check_selftest
 from cvo_edge.errors import SinkError
 from cvo_edge.heads.plausible import check_plausible
 from cvo_edge.odometer import Odometer
-from cvo_edge.programs.selftest import check_reaction, check_selftest
 
 
 def check_target(bundle_dir: Path) -> None:
     """Raise SinkError if the folder contains files that do not belong to a bundle."""
     own = {CALIBRATION_FILE, MODEL_FILE}
     if bundle_dir.exists() and not (
-        bundle_dir.is_dir() and {path.name for path in bundle_dir.iterdir()} in (own, set())
+        bundle_dir.is_dir()
+        # The signature of the bundle that is replaced goes with it.
+        and {path.name for path in bundle_dir.iterdir()} - {SIGNATURE_FILE} in (own, set())
     ):
         raise SinkError(
             f"{bundle_dir}: expected a new folder or a bundle to replace, found other files"

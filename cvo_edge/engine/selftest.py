@@ -2,23 +2,42 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any, Protocol
 
-from cvo_edge.engine.observation import Observation, Observer
+import numpy as np
+from numpy.typing import NDArray
+
+from cvo_edge.bundle.format import Calibration
+from cvo_edge.engine.observation import Observation
 from cvo_edge.errors import GateError
 from cvo_edge.input import preprocess
-from cvo_edge.odometer import Odometer
 
 # The solver computes in float64.
 _SOLVER_TOLERANCE = 1e-9
 
 
-def observe_selftest(observer: Observer | Odometer, height: int, width: int) -> Observation:
+class Observing(Protocol):
+    """What runs a network on images: an observer or an odometer."""
+
+    def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
+        """Run the network on one image."""
+
+
+class Testable(Observing, Protocol):
+    """A loaded bundle: an odometer."""
+
+    calibration: Calibration
+
+    def solver_error(self) -> float:
+        """Return how wrong the method's solver is on this machine."""
+
+
+def observe_selftest(observer: Observing, height: int, width: int) -> Observation:
     """Run the self-test image through preprocessing and network as frame 0."""
     return observer.observe(preprocess.selftest_image(height, width), seq=0)
 
 
-def check_reaction(odometer: Odometer) -> None:
+def check_reaction(odometer: Testable) -> None:
     """Raise GateError if the network gives the same outputs for the self-test image's negative.
 
     Nothing that a camera or its images do could then change the outputs, and a self-test of such a
@@ -35,7 +54,7 @@ def check_reaction(odometer: Odometer) -> None:
         )
 
 
-def check_selftest(odometer: Odometer) -> float:
+def check_selftest(odometer: Testable) -> float:
     """Compare all outputs with the expected ones; returns the largest absolute difference.
 
     Raises GateError if it exceeds the tolerance, or if the method's solver does not find a known
