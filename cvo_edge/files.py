@@ -12,6 +12,7 @@ import stat
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -266,14 +267,17 @@ def _refuse_inputs(output: str, inputs: Iterable[str | Path | None]) -> None:
     written, place = Path(output), os.path.realpath(output)
     if any(given is not None and os.path.realpath(given) == place for given in inputs):
         raise UsageError(f"output: expected a new file, found {output} among the inputs")
-    if not os.path.exists(written):  # noqa: PTH110 - also of a name too long
+    try:
+        output_stat = written.stat()
+    except (OSError, ValueError):  # also of a name too long, or of none
         return
     for given in inputs:
         if given is None:
             continue
         name = str(given)
-        files = [name, *glob.iglob(name, recursive=True), *glob.iglob(f"{glob.escape(name)}/*")]
-        if any(os.path.exists(file) and written.samefile(file) for file in files):  # noqa: PTH110
+        if any(map(partial(_is, output_stat), [name, *glob.iglob(name, recursive=True)])) or any(
+            map(partial(_is, output_stat), _maybe(output_stat, name))
+        ):
             raise UsageError(f"output: expected a new file, found {output} among the inputs")
 
 
@@ -299,6 +303,21 @@ def _refuse_foreign(output: str) -> None:
         )
 
 
+def _is(found: os.stat_result, path: str) -> bool:
+    try:
+        return os.path.samestat(found, os.stat(path))  # noqa: PTH116 - of hundreds of thousands
+    except (OSError, ValueError):
+        return False
+
+
+def _maybe(found: os.stat_result, folder: str) -> Iterator[str]:
+    """Yield the entries of a folder that may be a file, without their status."""
+    with suppress(OSError, ValueError), os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.inode() == found.st_ino or entry.is_symlink():
+                yield entry.path
+
+
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
     """Sort key that compares digits as numbers: ``frame-2`` before ``frame-10``."""
     parts = re.split("([0-9]+)", str(path))
@@ -307,3 +326,17 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
         for index, part in enumerate(parts)
         if part
     ]
+
+
+def natural_text(name: str) -> str:
+    """Sort key with the order of ``natural_key``, as one string, for hundreds of thousands."""
+    return _DIGITS.sub(_with_length, name)
+
+
+_DIGITS = re.compile("[0-9]+")
+
+
+def _with_length(found: re.Match[str]) -> str:
+    # No file's name holds the character 0, so that numbers come before all others.
+    digits = found[0].lstrip("0") or "0"
+    return f"\0{chr(len(digits))}{digits}"

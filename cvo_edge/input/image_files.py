@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
+from itertools import count, repeat
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
-from cvo_edge.errors import SourceError
-from cvo_edge.files import natural_key, read_regular_file
+from cvo_edge.errors import SourceError, printable
+from cvo_edge.files import natural_text, read_regular_file
 from cvo_edge.input.capture import shown
 from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image
 from cvo_edge.input.frame import Frame
@@ -20,20 +22,32 @@ from cvo_edge.input.stamps import read_stamps, stamps_in_names
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 
 
+NOT_COLOUR = "not marked as colour"
 # Words in a file's name that say what the image shows.
 _COLOUR = frozenset(("color", "colour", "rgb"))
 _NO_COLOUR = frozenset(
     ("depth", "disp", "disparity", "mask", "ir", "infrared", "normal", "normals")
 )
+# Most names hold none, and need not be taken apart.
+_ANY_MARK = re.compile("|".join(sorted(_COLOUR | _NO_COLOUR)), re.IGNORECASE)
 _WORD = re.compile("[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _COLOUR_SUFFIX = re.compile("[._-](color|colour|rgb)$")
 
 
 class Listing(NamedTuple):
-    """The images to use, in natural order, and the number of images left out, by reason."""
+    """The images to use, in natural order, and the number of files left out, by reason.
 
-    images: list[Path]
+    ``names`` are paths in ``folder``, or paths if that is empty: a folder may hold a million files.
+    """
+
+    folder: str
+    names: list[str]
     left_out: dict[str, int]
+
+    @property
+    def images(self) -> list[Path]:
+        """The paths of the images."""
+        return [Path(self.folder, name) for name in self.names]
 
 
 class ImageFiles:
@@ -48,25 +62,25 @@ class ImageFiles:
     def __init__(
         self, listing: Listing, fps: float | None, if_empty: str, stamps: str | None = None
     ) -> None:
-        paths, self.left_out = listing
-        if not paths:
+        self._folder, self._names, self.left_out = listing
+        if not self._names:
             reasons = f"; left out {left_out_text(self.left_out)}" if self.left_out else ""
             raise SourceError(if_empty + reasons)
-        self._paths = paths
-        names = [frame_name(path.name) for path in paths]
-        self._stamps_ns: Sequence[int | None]
+        files = map(os.path.basename, self._names)
+        self._stamps_ns: Iterable[int | None]
         if stamps is not None:
-            self._stamps_ns = read_stamps(stamps, names, [path.name for path in paths])
+            listed = list(files)
+            self._stamps_ns = read_stamps(stamps, list(map(frame_name, listed)), listed)
         elif fps is not None:
-            self._stamps_ns = [stamp_at(seq, fps) for seq in range(len(paths))]
+            self._stamps_ns = map(partial(stamp_at, fps=fps), count())
         else:
-            self._stamps_ns = stamps_in_names(names) or [None] * len(paths)
-        self.length: int | None = len(paths)
+            self._stamps_ns = stamps_in_names(map(frame_name, files)) or repeat(None)
+        self.length: int | None = len(self._names)
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield one call a file."""
-        for path, stamp_ns in zip(self._paths, self._stamps_ns, strict=True):
-            yield partial(_read_file, path, stamp_ns)
+        for name, stamp_ns in zip(self._names, self._stamps_ns, strict=False):
+            yield partial(read_image_file, os.path.join(self._folder, name), stamp_ns)  # noqa: PTH118
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield one frame a file."""
@@ -74,57 +88,109 @@ class ImageFiles:
             yield read()
 
 
-def _read_file(path: Path, stamp_ns: int | None) -> Frame:
+def read_image_file(path: str, stamp_ns: int | None) -> Frame:
+    """Read and decode one image file; a frame without an image if that fails."""
     start = perf_counter()
     try:
-        content = read_regular_file(path, MAX_IMAGE_BYTES, SourceError, links=True)
+        content = read_regular_file(Path(path), MAX_IMAGE_BYTES, SourceError, links=True)
         image = decode_image(content)
     except SourceError:
         image = None
     spent = 1e3 * (perf_counter() - start)
-    return Frame(image, stamp_ns, shown(path.name), spent)
+    return Frame(image, stamp_ns, shown(Path(path).name), spent)
 
 
 def images_in(folder: Path) -> Listing:
-    """Return the images of a folder, without hidden files; see ``colour_images``."""
-    # macOS leaves a hidden file beside each file on a card.
-    return colour_images(
-        [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
-    )
+    """Return the images of a folder, without hidden files; see ``colour_images``.
+
+    A link counts as the file that it names, also if that is missing: its frame has no image.
+
+    Raises SourceError if the folder cannot be read.
+    """
+    others: Counter[str] = Counter()
+    files: list[str] = []
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                # macOS leaves a hidden file beside each file on a card.
+                if entry.name.startswith("."):
+                    continue
+                if reason := not_a_file(entry):
+                    others[reason] += has_image_suffix(entry.name)
+                else:
+                    files.append(entry.name)
+    except OSError as error:
+        raise SourceError(f"{shown(str(folder))}: cannot be read: {error.strerror}") from None
+    return colour_images(files, str(folder), others)
 
 
-def colour_images(paths: Iterable[Path]) -> Listing:
+def not_a_file(entry: os.DirEntry[str]) -> str:
+    """Return why an entry of a folder is no file: ``a folder``; empty if it is one, or a link."""
+    # No status of files is asked for, which would take long for many of them.
+    try:
+        if entry.is_file(follow_symlinks=False):
+            return ""
+        if entry.is_dir():
+            return "a folder"
+    except OSError:
+        pass  # a link to itself, or to a place that may not be read
+    return "" if entry.is_symlink() else "no regular file"
+
+
+def has_image_suffix(name: str) -> bool:
+    """Whether a name ends as that of an image does."""
+    return name.lower().endswith(IMAGE_SUFFIXES)
+
+
+def colour_images(
+    files: Iterable[str], folder: str = "", others: Mapping[str, int] | None = None
+) -> Listing:
     """Return the images among files by the marks in their names.
 
     A mark is a word of the name, e.g. ``depth`` in ``00001-depth.png``. Images marked as anything
     but colour are left out; if some of the others are marked as colour, only those are used.
+    Files with another suffix are counted, too. ``others`` are what was left out before.
     """
-    unmarked: list[Path] = []
-    colour: list[Path] = []
-    left_out: Counter[str] = Counter()
-    for path in paths:
-        if path.suffix.lower() not in IMAGE_SUFFIXES:
-            continue
-        words = {word.lower() for word in _WORD.findall(path.stem)}
-        if words & _NO_COLOUR:
-            left_out[f"marked {min(words & _NO_COLOUR)}"] += 1
+    unmarked: list[str] = []
+    colour: list[str] = []
+    left_out = Counter(others or {})
+    for file in files:
+        is_colour, reason = mark_of(file.rpartition("/")[2])
+        if reason:
+            left_out[reason] += 1
         else:
-            (colour if words & _COLOUR else unmarked).append(path)
+            (colour if is_colour else unmarked).append(file)
     if colour and unmarked:
-        left_out["not marked as colour"] = len(unmarked)
-    return Listing(sorted(colour or unmarked, key=natural_key), dict(sorted(left_out.items())))
+        left_out[NOT_COLOUR] = len(unmarked)
+    images = colour or unmarked
+    # Names that differ in leading zeros alone come in one order, whatever that of the folder is.
+    images.sort()
+    images.sort(key=natural_text)
+    return Listing(folder, images, {key: n for key, n in sorted(left_out.items()) if n})
+
+
+def mark_of(name: str) -> tuple[bool, str]:
+    """Return whether a file is marked as a colour image, and why it is no frame, if it is none."""
+    if not has_image_suffix(name):
+        return False, os.path.splitext(name)[1].lower() or "without suffix"  # noqa: PTH122
+    if not _ANY_MARK.search(name):
+        return False, ""
+    words = {word.lower() for word in _WORD.findall(name, 0, name.rindex("."))}
+    if found := words & _NO_COLOUR:
+        return False, f"marked {min(found)}"
+    return bool(words & _COLOUR), ""
 
 
 def left_out_text(left_out: Mapping[str, int]) -> str:
-    """Return the number of images left out and the reasons: ``50 images: marked depth 50``."""
-    count = sum(left_out.values())
-    reasons = ", ".join(f"{reason} {number}" for reason, number in left_out.items())
-    return f"{count} image{'' if count == 1 else 's'}: {reasons}"
+    """Return the number of files left out and the reasons: ``50 files: marked depth 50``."""
+    total = sum(left_out.values())
+    reasons = ", ".join(f"{printable(reason)} {number}" for reason, number in left_out.items())
+    return f"{total} file{'' if total == 1 else 's'}: {reasons}"
 
 
 def frame_name(file_name: str) -> str:
     """Return an image's name without suffix and mark: ``00001`` for ``00001-color.png``."""
-    return _COLOUR_SUFFIX.sub("", Path(file_name).stem)
+    return _COLOUR_SUFFIX.sub("", os.path.splitext(file_name)[0])  # noqa: PTH122
 
 
 def stamp_at(seq: int, fps: float | None) -> int | None:

@@ -91,7 +91,9 @@ def open_source(
     except OSError as error:
         raise SourceError(f"{shown(text)}: not a usable name: {error.strerror}") from None
     if path.is_dir():
-        return ImageFiles(images_in(path), fps, f"{path}: expected images, found none", stamps)
+        return ImageFiles(
+            images_in(path), fps, f"{shown(text)}: expected images, found none", stamps
+        )
     if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
         raise SourceError(f"{shown(text)}: expected a file's path, found a file address")
     if names_camera(text):
@@ -103,7 +105,7 @@ def open_source(
         return Camera(int(text) if text.isdecimal() else text, fps, timeout_s)
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES or _is_one_image(path):
-            return ImageFiles(Listing([path], {}), fps, "", stamps)
+            return ImageFiles(Listing("", [text], {}), fps, "", stamps)
         if stamps == NAMES:
             raise UsageError(
                 f"stamps: expected a list of times for a video, found {NAMES}, which are those of "
@@ -112,7 +114,7 @@ def open_source(
         listed = None if stamps is None else ListedStamps(Path(stamps))
         return Video(path, fps, timeout_s, listed)
     if glob.has_magic(text):
-        found = [Path(name) for name in glob.glob(text, recursive=True) if Path(name).is_file()]
+        found = [name for name in glob.iglob(text, recursive=True) if not os.path.isdir(name)]  # noqa: PTH112
         return ImageFiles(
             colour_images(found), fps, f"{shown(text)}: expected images, found no match", stamps
         )

@@ -19,7 +19,7 @@ taken as stamps.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
@@ -37,15 +37,23 @@ _FORM = "stamps: timestamp file, timestamp,file or a time a line"
 _VIDEO_FORM = "stamps of a video: a time a line, timestamp frame or timestamp,frame"
 
 
-def stamps_in_names(names: Sequence[str]) -> list[int] | None:
+def stamps_in_names(names: Iterable[str]) -> list[int] | None:
     """Return the stamps (ns) that names without suffix end with, or None.
 
     None unless all names have a stamp since 1970 and each is later than the one before.
     """
-    stamps = [_stamp(name, _CERTAIN) for name in names]
-    known = [stamp for stamp in stamps if stamp is not None]
-    rising = all(first < second for first, second in pairwise(known))
-    return known if len(known) == len(stamps) and rising else None
+    known: list[int] = []
+    for name in names:
+        stamp = stamp_in_name(name)
+        if stamp is None or (known and stamp <= known[-1]):
+            return None
+        known.append(stamp)
+    return known
+
+
+def stamp_in_name(name: str) -> int | None:
+    """Return the stamp (ns) since 1970 that a name without suffix ends with, or None."""
+    return _stamp(name, _CERTAIN)
 
 
 def read_stamps(given: str, names: Sequence[str], files: Sequence[str]) -> list[int]:

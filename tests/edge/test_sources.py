@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.files import natural_key, natural_text
 from cvo_edge.input.capture import READER, Capture
 from cvo_edge.input.containers import is_video
 from cvo_edge.input.decoding import decode_image
+from cvo_edge.input.image_files import colour_images, left_out_text
 from cvo_edge.input.sources import Video, _VideoStamps, open_source
 
 
@@ -149,9 +151,43 @@ def test_a_folder_without_colour_images_says_what_it_left_out(tmp_path):
     with pytest.raises(SourceError) as refused:
         open_source(str(tmp_path))
     assert str(refused.value) == (
-        f"{tmp_path}: expected images, found none; left out 2 images: marked depth 1, marked mask 1"
+        f"{tmp_path}: expected images, found none; left out 2 files: marked depth 1, marked mask 1"
     )
     assert names(open_source(str(tmp_path / "1-depth.png"))) == ["1-depth.png"]
+
+
+def test_what_a_folder_holds_beside_its_images_is_counted_and_a_dangling_link_is_a_frame(tmp_path):
+    """Also a link to itself; a link to an image is that image. Hidden files are not counted."""
+    write(tmp_path / "1.jpg")
+    for name in ("1.heic", "2.HEIC", "list.txt", "README", ".hidden.heic", "odd\n.x\ny"):
+        (tmp_path / name).write_bytes(b"?")
+    (tmp_path / "3.png").symlink_to("1.jpg")
+    (tmp_path / "4.png").symlink_to("nowhere.png")
+    (tmp_path / "5.png").symlink_to("5.png")
+    (tmp_path / "6.png").mkdir()
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "7.png")
+    source = open_source(tmp_path)
+    assert [(frame.source, frame.image is None) for frame in source] == [
+        ("1.jpg", False),
+        ("3.png", False),
+        ("4.png", True),
+        ("5.png", True),
+    ]
+    assert left_out_text(source.left_out) == (
+        "7 files: .heic 2, .txt 1, .x\\ny 1, a folder 1, no regular file 1, without suffix 1"
+    )
+
+
+def test_the_order_of_a_folder_is_natural_and_does_not_depend_on_that_of_its_entries(tmp_path):
+    texts = ("a1", "a01", "a2", "a10", "a1b2", "a1b10", "b", "a", "1", "02", "a1-", "a-1", "\u00b2")
+    shuffled = np.random.default_rng(0).permutation(texts).tolist()
+    assert sorted(shuffled, key=natural_text) == sorted(
+        shuffled, key=lambda s: natural_key(Path(s))
+    )
+    assert colour_images([f"{text}.png" for text in shuffled]) == colour_images(
+        [f"{text}.png" for text in texts]
+    )
 
 
 @pytest.mark.parametrize("name", ["a.jpe", "a.jfif", "a", "a.pbm", "a.mp4"])
