@@ -20,6 +20,7 @@ from pathlib import Path
 import accuracy_tables
 import comparison_tables
 import localiser_tables
+import message_tables
 import motion_tables
 import odometry_tables
 import promised_table
@@ -54,6 +55,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **speed_tables.TABLES,
     **vigilance_tables.TABLES,
     **promised_table.TABLES,
+    **message_tables.TABLES,
     **motion_tables.TABLES,
     **odometry_tables.TABLES,
     **recording_tables.TABLES,
