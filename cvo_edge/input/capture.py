@@ -10,12 +10,15 @@ import contextlib
 import math
 import os
 import re
+import select
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Event, Thread, current_thread
 from typing import Any, NamedTuple, Protocol, TypeVar
+from weakref import WeakSet
 
 import cv2
 import numpy as np
@@ -31,7 +34,7 @@ READER = "cvo-edge reader"
 
 TIMEOUT_S = 5.0
 # Opening takes longer than the next frame: an address is resolved, a format is probed.
-_OPENING = 2.0
+OPENING = 2.0
 _PARTS = 20
 # Releasing a device takes milliseconds.
 _RELEASE_S = 1.0
@@ -47,6 +50,10 @@ _INTRA = frozenset(
         *(b"AVdn", b"apch", b"apcn", b"apcs", b"apco", b"ap4h", b"ap4x"),
     )
 )
+
+# Attempts that never answered, in this process. Each keeps a thread.
+_MOST_HANGING = 16
+_hanging: WeakSet[Thread] = WeakSet()
 
 T = TypeVar("T")
 
@@ -101,6 +108,9 @@ class Capture:
     """
 
     def __init__(self, device: int | str, timeout_s: float, clock: Clock = SYSTEM_CLOCK) -> None:
+        hanging = sum(thread.is_alive() for thread in _hanging)
+        if hanging >= _MOST_HANGING:
+            raise SourceError(f"{shown(device)}: {hanging} earlier attempts still hang in OpenCV")
         self._device, self._timeout_s = device, timeout_s
         self._calls: SimpleQueue[Callable[[_Opened], object] | None] = SimpleQueue()
         self._answers: SimpleQueue[object] = SimpleQueue()
@@ -115,6 +125,7 @@ class Capture:
             raise SourceError(
                 f"{shown(device)}: cannot start its reading thread: {error}"
             ) from None
+        self._thread = thread
         # Also when Python exits, before it ends threads inside OpenCV and aborts.
         self._end = weakref.finalize(self, _end, thread, self._calls, self._idle)
 
@@ -134,7 +145,8 @@ class Capture:
             raise SourceError(
                 f"{shown(device)}: the name is not valid UTF-8, which OpenCV needs; rename it"
             ) from None
-        found = self._ask(lambda opened: opened.open(device), _OPENING * self._timeout_s)
+        wait_s = OPENING * self._timeout_s
+        found = self._ask(lambda opened: opened.open(device, wait_s), wait_s)
         if found is None:
             self.close()
             raise SourceError(f"{shown(device)}: did not open as a video or camera")
@@ -172,8 +184,9 @@ class Capture:
                 answer = self._answers.get(timeout=timeout_s / _PARTS)
                 break
         else:
+            _hanging.add(self._thread)
             self.close()
-            raise SourceError(f"{shown(self._device)}: gave no answer within {timeout_s:g} s")
+            raise _no_answer(self._device, timeout_s)
         if isinstance(answer, Exception):
             raise answer
         return answer  # type: ignore[return-value]  # the answer to this call
@@ -222,12 +235,13 @@ class _Opened:
         self._driver: DriverStamps | None = None
         self._fresh_noise = True
 
-    def open(self, device: int | str) -> _Stated | None:
+    def open(self, device: int | str, wait_s: float) -> _Stated | None:
         """Open the device; return what it states of itself, None if it does not open."""
         begin = self._clock.now_s()
         try:
-            if not self._capture.open(device):
-                return None
+            with _written_to(device, wait_s):
+                if not self._capture.open(device):
+                    return None
             # As for image files: pixels in the sensor's order, whatever the container asks for.
             self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
             fps, count = map(self._capture.get, (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
@@ -276,3 +290,31 @@ class _Opened:
     def release(self) -> None:
         """Release the device."""
         self._capture.release()
+
+
+@contextlib.contextmanager
+def _written_to(device: int | str, wait_s: float) -> Iterator[None]:
+    """Hold a named pipe open that has begun to give bytes; raises SourceError if it gives none.
+
+    OpenCV opens one stream at a time and would wait for ever, also for another stream.
+    """
+    pipe = None
+    if not isinstance(device, int) and Path(device).is_fifo():
+        # One that cannot be opened is left to OpenCV.
+        with contextlib.suppress(OSError):
+            pipe = os.open(device, os.O_RDONLY | os.O_NONBLOCK)
+    if pipe is None:
+        yield
+        return
+    try:
+        waiting = select.poll()
+        waiting.register(pipe, select.POLLIN)
+        if not waiting.poll(1e3 * wait_s):
+            raise _no_answer(device, wait_s)
+        yield
+    finally:
+        os.close(pipe)
+
+
+def _no_answer(device: int | str, wait_s: float) -> SourceError:
+    return SourceError(f"{shown(device)}: gave no answer within {wait_s:g} s")

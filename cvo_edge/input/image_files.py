@@ -15,12 +15,13 @@ from typing import NamedTuple
 from cvo_edge.errors import SourceError, printable
 from cvo_edge.files import natural_text, read_regular_file
 from cvo_edge.input.capture import shown
-from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image
+from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image, is_image
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.stamps import read_stamps, stamps_in_names
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
-
+# Videos whose first bytes are those of an image.
+_JPEGS_IN_A_ROW = (".mjpg", ".mjpeg")
 
 NOT_COLOUR = "not marked as colour"
 # Words in a file's name that say what the image shows.
@@ -186,6 +187,17 @@ def left_out_text(left_out: Mapping[str, int]) -> str:
     total = sum(left_out.values())
     reasons = ", ".join(f"{printable(reason)} {number}" for reason, number in left_out.items())
     return f"{total} file{'' if total == 1 else 's'}: {reasons}"
+
+
+def is_one_image(path: Path) -> bool:
+    """Whether a file without an image's suffix is one; FFmpeg would read it as a video."""
+    if path.suffix.lower() in _JPEGS_IN_A_ROW:
+        return False
+    try:
+        with path.open("rb") as stream:
+            return is_image(stream.read(16))
+    except OSError:
+        return False
 
 
 def frame_name(file_name: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import logging
 import math
 import os
 import re
@@ -16,11 +15,10 @@ from pathlib import Path
 from threading import Event
 from typing import SupportsIndex, TypeVar
 
-from cvo_edge.errors import SourceError, UsageError, printable
-from cvo_edge.input.capture import TIMEOUT_S, Capture, Reader, shown
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.input.capture import OPENING, TIMEOUT_S, Capture, Reader, shown
 from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
 from cvo_edge.input.containers import check_video
-from cvo_edge.input.decoding import is_image
 from cvo_edge.input.frame import Frame, Source
 from cvo_edge.input.image_files import (
     IMAGE_SUFFIXES,
@@ -28,12 +26,11 @@ from cvo_edge.input.image_files import (
     Listing,
     colour_images,
     images_in,
+    is_one_image,
     stamp_at,
 )
 from cvo_edge.input.stamps import NAMES, ListedStamps
-
-# Videos whose first bytes are those of an image.
-_JPEGS_IN_A_ROW = (".mjpg", ".mjpeg")
+from cvo_edge.input.waiting import LONGEST_PAUSE_S, FewAttempts, Patience
 
 # Stamps are nanoseconds in 64 bits, which must last for years.
 LOWEST_FPS, HIGHEST_FPS = 1e-3, 1e6
@@ -41,8 +38,6 @@ LONGEST_S = 3600.0
 
 # Pauses before each new attempt to open a camera: eight seconds in total.
 PAUSES_S = (0.25, 0.5, 1.0, 2.0, 4.0)
-
-_LOG = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -52,6 +47,7 @@ def open_source(
     fps: float | None = None,
     timeout_s: float = TIMEOUT_S,
     stamps: str | None = None,
+    patience: Patience | None = None,
 ) -> Source:
     """Open a folder of images, a glob, a video file, a camera or a stream.
 
@@ -69,6 +65,8 @@ def open_source(
     stamps
         Where the stamps are: ``names`` of image files, or a file such as ``rgb.txt``, ``data.csv``
         or ``times.txt``, also for a video (see ``cvo_edge.input.stamps``).
+    patience
+        How long a camera is waited for, see ``Camera``.
 
     Raises
     ------
@@ -102,9 +100,10 @@ def open_source(
                 f"stamps: expected images or a video, whose stamps they are, found {shown(text)}, "
                 "whose frames are stamped as they arrive"
             )
-        return Camera(int(text) if text.isdecimal() else text, fps, timeout_s)
+        device = int(text) if text.isdecimal() else text
+        return Camera(device, fps, timeout_s, patience=patience)
     if path.is_file():
-        if path.suffix.lower() in IMAGE_SUFFIXES or _is_one_image(path):
+        if path.suffix.lower() in IMAGE_SUFFIXES or is_one_image(path):
             return ImageFiles(Listing("", [text], {}), fps, "", stamps)
         if stamps == NAMES:
             raise UsageError(
@@ -139,7 +138,10 @@ def names_camera(text: str) -> bool:
     path = Path(text)
     if path.is_dir():
         return False
-    return text.isdecimal() or path.is_char_device() or path.is_fifo() or "://" in text
+    if text.isdecimal() or path.is_char_device() or path.is_fifo() or "://" in text:
+        return True
+    # A camera that is not plugged in has no device.
+    return path.parts[:2] == ("/", "dev") and path.parts[2:3] != ("shm",) and not path.exists()
 
 
 class Video:
@@ -254,6 +256,16 @@ class Camera:
     takes age in the queues of drivers.
 
     ``reader`` makes what frames are read from, and ``clock`` measures the time; tests replace both.
+    With a ``patience``, it decides how often a camera is opened again, and the first attempt is
+    made when frames are asked for.
+
+    Attributes
+    ----------
+    delivered
+        Number of frames so far.
+    heard_s
+        When the last attempt to open or read began, on ``Clock.awake_s``; it, and the pause before
+        the next, come to an end in ``longest_silence_s``.
     """
 
     live = True
@@ -269,19 +281,29 @@ class Camera:
         *,
         clock: Clock = SYSTEM_CLOCK,
         reader: Callable[[int | str, float], Reader] = Capture,
+        patience: Patience | None = None,
     ) -> None:
         self._device, self._fps, self._timeout_s = device, fps, timeout_s
         self._clock, self._reader = clock, reader
         self._capture: Reader | None = None
-        self._failures = self._since_opened = 0
+        self._since_opened = 0
+        self._patience = patience or FewAttempts(lambda: PAUSES_S)
         self._stopped = Event()
         self.length: int | None = None
-        self._insisting(self._opened)
+        self.delivered, self.heard_s = 0, clock.awake_s()
+        # One that is waited for may come at any later time.
+        if patience is None:
+            self._insisting(self._opened)
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield the frames; each is read before its call is yielded."""
         for frame in self:
             yield partial(_itself, frame)
+
+    @property
+    def longest_silence_s(self) -> float:
+        """The longest time between two attempts, s."""
+        return (OPENING + 1.0) * self._timeout_s + LONGEST_PAUSE_S
 
     def stop(self) -> None:
         """End the frames, also while the next one is waited for."""
@@ -290,7 +312,6 @@ class Camera:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until ``stop``; raises SourceError if the camera does not come back."""
-        seq = 0
         try:
             while not self._stopped.is_set():
                 frames = self._insisting(self._next)
@@ -299,11 +320,12 @@ class Camera:
                 self._since_opened += 1
                 if self._since_opened > 1:
                     # An address of single pictures gives one frame per connection.
-                    self._failures = 0
+                    self._patience.gave_frame()
                 for frame in frames:
+                    seq = self.delivered
                     stamp_ns = stamp_at(seq, self._fps) if self._fps else frame.stamp_ns
+                    self.delivered += 1
                     yield replace(frame, stamp_ns=stamp_ns, source=f"{shown(self._device)}#{seq}")
-                    seq += 1
         finally:
             self._close()
 
@@ -351,6 +373,7 @@ class Camera:
         None and a SourceError are failures of the call.
         """
         while not self._stopped.is_set():
+            self.heard_s = self._clock.awake_s()
             try:
                 found = call()
             except SourceError as error:
@@ -362,27 +385,9 @@ class Camera:
             self._close()
             if self._stopped.is_set():
                 break
-            if self._failures == len(PAUSES_S):
-                raise SourceError(
-                    f"{problem} ({self._failures + 1} attempts); check the camera and its address"
-                )
-            pause_s = PAUSES_S[self._failures]
-            _LOG.warning("%s; opening it again in %g s", printable(problem), pause_s)
-            self._clock.wait(self._stopped, pause_s)
-            self._failures += 1
+            self._clock.wait(self._stopped, self._patience.failed(problem))
         return None
 
 
 def _itself(frame: Frame) -> Frame:
     return frame
-
-
-def _is_one_image(path: Path) -> bool:
-    """Whether a file without an image's suffix is one; FFmpeg would read it as a video."""
-    if path.suffix.lower() in _JPEGS_IN_A_ROW:
-        return False
-    try:
-        with path.open("rb") as stream:
-            return is_image(stream.read(16))
-    except OSError:
-        return False

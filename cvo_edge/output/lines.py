@@ -69,18 +69,21 @@ class LineFile:
         check_output(path, force=existing == "force")
         try:
             self._descriptor = _opened(path) if self._owned else sys.stdout.fileno()
-            self._alone()
         except OSError as error:
             raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
+        try:
+            self._lock()
+        except SinkError:
+            os.close(self._descriptor)
+            raise
 
-    def _alone(self) -> None:
+    def _lock(self) -> None:
         """Lock a regular file against a second writer; the lock ends with the process."""
         if not self._owned or not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
             return
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            os.close(self._descriptor)
             raise SinkError(
                 f"{self._name}: another run is writing to this file; choose another output"
             ) from None
@@ -103,8 +106,11 @@ class LineFile:
 
     @property
     def started(self) -> bool:
-        """Whether the file has a beginning; one that was opened again and is empty has none."""
+        """Whether the file has a beginning; one that was emptied or opened again may have none."""
         self._open_again()
+        if self._owned and self._started:
+            found = os.fstat(self._descriptor)
+            self._started = found.st_size > 0 or not stat.S_ISREG(found.st_mode)
         return self._started
 
     def write(self, line: bytes) -> None:
@@ -112,8 +118,7 @@ class LineFile:
 
         Raises SinkError if writing fails and BrokenPipeError if the reader closed the pipe.
         """
-        if not self.started:
-            self._started = True
+        if not (started := self.started):
             # Keep the old contents until the first new line is ready.
             self._make_room()
         elif self._owned:
@@ -130,8 +135,11 @@ class LineFile:
                 reader.register(self._descriptor, select.POLLOUT)
                 reader.poll()
             except OSError as error:
-                self._take_back(written - (line[:written].rfind(b"\n") + 1))
+                whole = line[:written].rfind(b"\n") + 1
+                self._take_back(written - whole)
+                self._started = started or whole > 0
                 raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
+        self._started = True
 
     def _make_room(self) -> None:
         """Truncate a file that is replaced, or remove the incomplete last line of one that is not.
@@ -149,15 +157,16 @@ class LineFile:
         """Open the file by its name again if ``reopen_files`` was called."""
         if not self._owned or self._opened == _reopening:
             return
-        self._opened = _reopening
+        asked = _reopening
         try:
             descriptor = _opened(self._name)
         except OSError as error:
             raise SinkError(f"{self._name}: cannot be opened again: {error.strerror}") from None
         os.close(self._descriptor)
         self._descriptor = descriptor
-        self._alone()
-        self._started &= os.fstat(descriptor).st_size > 0
+        self._lock()
+        # Only now, so that a file that cannot be opened or locked yet is tried again.
+        self._opened = asked
 
     def _tell_of_a_lost_name(self) -> None:
         if self._told is not None and not self._has_name():

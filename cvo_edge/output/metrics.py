@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from types import TracebackType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +16,31 @@ _ADDRESS = "127.0.0.1"
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.033, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
+class Count(NamedTuple):
+    """A figure that is asked for when the metrics are read."""
+
+    name: str
+    help: str
+    value: float
+    grows: bool = True
+
+
+# What a service counts beside the frames that it estimates.
+Counts = Callable[[], list[Count]]
+
+
+class _Asked:
+    """A collector of counts, as the library's registry asks for them."""
+
+    def __init__(self, kinds: Any, counts: Counts) -> None:  # noqa: ANN401 - the library
+        self._counter, self._gauge = kinds.CounterMetricFamily, kinds.GaugeMetricFamily
+        self._counts = counts
+
+    def collect(self) -> Iterator[Any]:
+        for name, text, value, grows in self._counts():
+            yield (self._counter if grows else self._gauge)(name, text, value=value)
+
+
 class MetricsSink:
     """Serves counts, latencies, widths and the state of the alarm under ``/metrics``.
 
@@ -21,6 +48,8 @@ class MetricsSink:
     ----------
     port
         On the loopback interface; 0: any free one.
+    counts
+        Returns further figures whenever the metrics are read.
 
     Attributes
     ----------
@@ -30,9 +59,10 @@ class MetricsSink:
     Raises UsageError if prometheus-client is not installed, and SinkError if the port is taken.
     """
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, counts: Counts | None = None) -> None:
         try:
             import prometheus_client as kinds
+            from prometheus_client import core
         except ImportError:
             raise UsageError(
                 'metrics: prometheus-client is not installed; pip install "cvo-edge[metrics]"'
@@ -44,6 +74,10 @@ class MetricsSink:
         )
         for status in Status:
             self._frames.labels(status.value)
+        self._skipped = kinds.Counter(
+            "cvo_skipped_frames", "Frames dropped for newer ones.", registry=registry
+        )
+        self._next_seq = 0
         self._reasons = kinds.Counter(
             "cvo_reasons", "Remarks on frames.", ["reason"], registry=registry
         )
@@ -68,6 +102,8 @@ class MetricsSink:
         self._stamp = kinds.Gauge(
             "cvo_last_stamp_seconds", "Stamp of the last frame.", registry=registry
         )
+        if counts is not None:
+            registry.register(_Asked(core, counts))
         try:
             self._server, self._thread = kinds.start_http_server(
                 port, addr=_ADDRESS, registry=registry
@@ -94,6 +130,8 @@ class MetricsSink:
     def write(self, estimate: PoseInterval) -> None:
         """Count one frame."""
         self._frames.labels(estimate.status.value).inc()
+        self._skipped.inc(max(0, estimate.seq - self._next_seq))
+        self._next_seq = estimate.seq + 1
         for reason in estimate.reasons:
             self._reasons.labels(reason.value).inc()
         if estimate.bounded:

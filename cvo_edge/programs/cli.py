@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -25,12 +25,11 @@ from cvo_edge.programs.options import (
     JsonOption,
     ThreadsOption,
     examples,
+    model_cache,
 )
-from cvo_edge.programs.running import model_cache, run
+from cvo_edge.programs.running import run
+from cvo_edge.programs.serve import serve
 from cvo_edge.vocabulary import Mode
-
-if TYPE_CHECKING:
-    pass
 
 app = typer.Typer(
     rich_markup_mode="rich",
@@ -72,6 +71,12 @@ app.command(
         "cvo-edge run my-bundle images/ --ground-truth images/ -o out.jsonl",
     )
 )(run)
+app.command(
+    epilog=examples(
+        "cvo-edge serve my-bundle /dev/video0 -o /var/lib/cvo-edge/records.jsonl",
+        "cvo-edge serve my-bundle rtsp://10.0.0.7/stream -o records.jsonl --metrics 9100",
+    )
+)(serve)
 
 
 @app.command(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cvo_edge.errors import UsageError
-from cvo_edge.vocabulary import Existing, Format, Mode
+from cvo_edge.vocabulary import Existing, Format, Mode, Scope
+
+if TYPE_CHECKING:
+    from cvo_edge.engine.model_cache import ModelCache
 
 INTERVALS, RUNTIME, REPORT = "Intervals", "Runtime", "Output"
 ADAPTATION = "Adaptation"
@@ -30,6 +33,15 @@ def existing_file(append: bool, force: bool, format: str) -> Existing:
     if append and format in ("csv", "mcap", "table"):
         raise UsageError(f"--append: expected the format jsonl or tum, found {format}")
     return "append" if append else "force" if force else "replace"
+
+
+def model_cache(wanted: bool) -> ModelCache | None:
+    """Return the user's cache of models, imported only where it is wanted."""
+    if not wanted:
+        return None
+    from cvo_edge.engine.model_cache import ModelCache
+
+    return ModelCache.default()
 
 
 # readable: a file that cannot be read has an exit code of ours.
@@ -203,6 +215,46 @@ StateOption = Annotated[
         readable=False,
         show_default=False,
         rich_help_panel=ADAPTATION,
+    ),
+]
+MavlinkOption = Annotated[
+    str | None,
+    typer.Option(
+        "--mavlink",
+        metavar="<address>",
+        help="Also send poses to an autopilot: udpout:HOST:PORT, tcp:HOST:PORT or "
+        "/dev/ttyUSB0:BAUD; with --map and --base.",
+        show_default=False,
+        rich_help_panel=REPORT,
+    ),
+]
+MetricsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--metrics",
+        min=1,
+        max=65535,
+        metavar="<port>",
+        help="Also serve figures for Prometheus on this port of the loopback interface.",
+        show_default=False,
+        rich_help_panel=REPORT,
+    ),
+]
+SourceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="Folder of images, glob, video file, camera index or device, or stream address.",
+        show_default=False,
+    ),
+]
+RunConfidenceOption = Annotated[
+    float, typer.Option(help="A confidence stored in the bundle.", rich_help_panel=INTERVALS)
+]
+RunScopeOption = Annotated[
+    Scope,
+    typer.Option(
+        help="Whether it holds for each degree of freedom or for all six at once.",
+        rich_help_panel=INTERVALS,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]

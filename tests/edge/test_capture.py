@@ -4,6 +4,7 @@ import contextlib
 import http.server
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -21,6 +22,7 @@ from cvo_edge import SourceError, UsageError, open_source
 from cvo_edge.input.capture import READER, Capture, Grabbed, shown
 from cvo_edge.input.clock import Clock
 from cvo_edge.input.sources import PAUSES_S, Camera
+from cvo_edge.output.records import read_records
 
 # Only a defect makes a wait take this long.
 HANGS_S = 120.0
@@ -510,3 +512,43 @@ def test_time_ready_to_run_counts_as_busy_where_the_kernel_reports_it(
     monkeypatch.setattr("cvo_edge.input.clock._SCHEDSTAT", path)
     monkeypatch.setattr("time.thread_time", lambda: 11.0)
     assert Clock().busy_s() == pytest.approx(busy_s)
+
+
+def test_a_service_accounts_for_every_frame_of_a_camera_that_comes_and_goes(
+    bundle_dir, network_camera, tmp_path
+):
+    """Its file is renamed meanwhile; it is asked to open it again, and to end."""
+    camera, path = network_camera(20, 8, 30), tmp_path / "a.jsonl"
+    command = ["serve", bundle_dir, camera.address, "-o", path, "--threads", "1"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "cvo_edge", *map(str, command)],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as service:
+        lines = iter(service.stderr.readline, "")
+        said = ["", *(line for line in takewhile_back(lines, 2))]
+        path.rename(tmp_path / "a.jsonl.1")
+        service.send_signal(signal.SIGHUP)
+        service.send_signal(signal.SIGUSR1)
+        said += [next(line for line in lines if line.startswith("health"))]
+        service.send_signal(signal.SIGTERM)
+        said += lines
+        assert service.wait(HANGS_S) == 0
+    text = "".join(said)
+    assert text.count("camera lost") == text.count("camera back") == 2
+    delivered, frames, skipped = map(
+        int, re.search(r"(\d+) frames delivered = (\d+) estimated \+ (\d+) dropped", text).groups()
+    )
+    assert delivered == frames + skipped > 28
+    written = [len(list(read_records(each))) for each in tmp_path.glob("a.jsonl*")]
+    assert sum(written) == frames
+
+
+def takewhile_back(lines, times):
+    """Yield lines until the camera has come back so often."""
+    for line in lines:
+        yield line
+        times -= line.startswith("camera back")
+        if not times:
+            return

@@ -1,0 +1,160 @@
+"""What ``run`` and ``serve`` open alike: the source, the odometer, and the sinks of estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from cvo_edge.camera import read_camera
+from cvo_edge.errors import UsageError
+from cvo_edge.estimate import PoseInterval
+from cvo_edge.ground_truth import GroundTruth
+from cvo_edge.input.frame import Source
+from cvo_edge.input.sources import open_source
+from cvo_edge.input.waiting import Patience
+from cvo_edge.odometer import Odometer
+from cvo_edge.output.mavlink import MavlinkSink
+from cvo_edge.output.metrics import Counts, MetricsSink
+from cvo_edge.output.opening import Writing, open_sink
+from cvo_edge.output.records import header_of
+from cvo_edge.process import say
+from cvo_edge.programs.conversion import placement_of
+from cvo_edge.programs.options import model_cache
+from cvo_edge.programs.run import RunSummary
+from cvo_edge.vocabulary import Existing, Format, Mode, Scope
+
+# What is written, and what opens it.
+Opening = Callable[[], AbstractContextManager[Writing]]
+Around = Callable[[str, Opening], AbstractContextManager[Writing]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """The options that both commands have; each means what its help says.
+
+    ``placing`` holds base, map, frame name, child frame name and unknown variance.
+    """
+
+    bundle: Path
+    source: str
+    output: str
+    format: Format
+    existing: Existing
+    region: bool
+    confidence: float
+    scope: Scope
+    camera: Path | None
+    timeout: float
+    mode: Mode | None
+    threads: int | None
+    cache: bool
+    public_key: Path | None
+    name: str | None
+    state: Path | None
+    mavlink: str | None
+    metrics: int | None
+    placing: tuple[str | None, str | None, str | None, str | None, float | None]
+    fps: float | None = None
+    stamps: str | None = None
+    adapt: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """An odometer, its source, and where its estimates go."""
+
+    odometer: Odometer
+    frames: Source
+    summary: RunSummary
+    sinks: list[Writing]
+
+    def write(self, estimate: PoseInterval) -> None:
+        """Write an estimate to every sink."""
+        for sink in self.sinks:
+            sink.write(estimate)
+
+
+def _plainly(_: str, opening: Opening) -> AbstractContextManager[Writing]:
+    return opening()
+
+
+@contextmanager
+def opened(
+    wanted: Wanted,
+    *,
+    truth: GroundTruth | None = None,
+    patience: Patience | None = None,
+    around: Around = _plainly,
+    counts: Counts | None = None,
+) -> Iterator[Job]:
+    """Open what is wanted, and close it at the end.
+
+    ``patience`` is for a camera, ``around`` opens a sink by its name and its opening, ``counts``
+    are added to the metrics.
+    """
+    frames = open_source(wanted.source, wanted.fps, wanted.timeout, wanted.stamps, patience)
+    with (
+        Odometer.load(
+            wanted.bundle,
+            threads=wanted.threads,
+            mode=wanted.mode or ("live" if frames.live else "latency"),
+            confidence=wanted.confidence,
+            scope=wanted.scope,
+            camera=read_camera(wanted.camera) if wanted.camera else None,
+            adapt=wanted.adapt,
+            state=wanted.state,
+            cache=model_cache(wanted.cache),
+            public_key=wanted.public_key,
+            name=wanted.name,
+        ) as odometer,
+        ExitStack() as stack,
+    ):
+        if wanted.region and not odometer.has_region:
+            raise UsageError(
+                f"--region: expected a bundle of mcqr, scr or fused and the joint scope, found "
+                f"{odometer.calibration.method} and {wanted.scope}"
+            )
+        openings = _openings(wanted, odometer, frames, counts)
+        sinks = [stack.enter_context(around(name, opening)) for name, opening in openings]
+        summary = RunSummary(odometer.chart.dof, wanted.confidence, wanted.scope, truth=truth)
+        yield Job(odometer, frames, summary, sinks)
+
+
+def _openings(
+    wanted: Wanted, odometer: Odometer, frames: Source, counts: Counts | None
+) -> Iterator[tuple[str, Opening]]:
+    """Yield what estimates are sent to."""
+    header = header_of(
+        odometer.calibration,
+        odometer.chart,
+        odometer.confidence,
+        wanted.scope,
+        stamps="fps" if wanted.fps else "arrival" if frames.live else None,
+    )
+    placed = placement_of(header, *wanted.placing)
+    base, map_pose, *_ = wanted.placing
+    if wanted.mavlink is not None and (base is None or map_pose is None):
+        raise UsageError(
+            "--mavlink: expected --map, the bundle's world in north, east, down, and --base, "
+            "the vehicle's forward, right, down in the camera"
+        )
+    yield (
+        "records",
+        partial(
+            open_sink,
+            wanted.output,
+            wanted.format,
+            header,
+            placed if wanted.format == "mcap" or wanted.mavlink is None else None,
+            region=wanted.region,
+            existing=wanted.existing,
+            told=say,
+        ),
+    )
+    if wanted.mavlink is not None and placed is not None:
+        yield "messages", partial(MavlinkSink, wanted.mavlink, placed)
+    if wanted.metrics is not None:
+        yield "metrics", partial(MetricsSink, wanted.metrics, counts)
