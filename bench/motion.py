@@ -177,7 +177,6 @@ def left_out(pairs: Sequence[Pair]) -> dict[str, Any]:
     return {
         "horizons": [summary(name, rows) for name, rows in found.items()],
         "tubes": [tube(name, widths, audits) for name, widths in tubes.items()],
-        "covariances": covariances(audits),
         "online": online_summary(adapted),
     }
 
@@ -281,27 +280,6 @@ def tube(name: str, widths: list[Array], audits: Sequence[RecordingAudit]) -> di
         "inside": np.mean([(w.position, w.rotation, w.six) for w in whole], axis=0).tolist(),
         "over_bands": [*ratio[6:].tolist(), float(ratio[:6].mean())],
     }
-
-
-def covariances(audits: Sequence[RecordingAudit]) -> list[dict[str, Any]]:
-    """Return mean and median over recordings of NEES over six, and the mean share inside."""
-    rows: dict[tuple[str, str], list[Any]] = {}
-    for one in audits:
-        for each in one.horizons:
-            if each.motions:
-                rows.setdefault(("interval", each.horizon), []).append(each)
-        for span in one.integrated:
-            rows.setdefault(("integrated", f"{span.seconds:g}s"), []).append(span)
-    return [
-        {
-            "covariance": kind,
-            "over": over,
-            "nees": float(np.mean([each.nees for each in found])),
-            "nees_median": float(np.median([each.nees for each in found])),
-            "inside": float(np.mean([each.nees_inside for each in found])),
-        }
-        for (kind, over), found in rows.items()
-    ]
 
 
 def one_drive(

@@ -70,29 +70,6 @@ def tubes() -> str:
     )  # fmt: skip
 
 
-def covariances() -> str:
-    """One row for each covariance and time, both sets side by side."""
-    sets = results()
-    by_set = [
-        {(each["covariance"], each["over"]): each for each in found["covariances"]}
-        for found in sets
-    ]
-    return table(
-        ["covariance", "over", *(f"{found['set']}: NEES / 6 (median), inside" for found in sets)],
-        [
-            [
-                *key,
-                *(
-                    f"{each[key]['nees']:.2f} ({each[key]['nees_median']:.2f}), "
-                    f"{each[key]['inside']:.2f}"
-                    for each in by_set
-                ),
-            ]
-            for key in by_set[0]
-        ],
-    )
-
-
 def online() -> str:
     """One row for each horizon and delay, both sets side by side."""
     sets = results()
@@ -187,7 +164,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "motion": motion,
     "motion-alignment": alignment,
     "motion-tubes": tubes,
-    "motion-covariances": covariances,
     "motion-online": online,
     "motion-costs": costs,
     "motion-fleet": fleet,

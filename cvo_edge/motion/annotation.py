@@ -209,7 +209,8 @@ def _motions(
     metres = rows.path_m[found.end] - rows.path_m[found.start]
     covariances: Iterable[tuple[float, ...] | UnsetType] = _UNSET
     if covariance:
-        fixed = in_fixed_axes(horizon.shape.covariance(found.scale), found.moved[:, 3:])
+        own = horizon.shape.covariance(found.scale, found.bias)
+        fixed = in_fixed_axes(own, found.moved[:, 3:])
         covariances = map(tuple, fixed.reshape(-1, 36).tolist())
     x, y, z, *q = found.moved.T.tolist()
     position, rotation = (

@@ -327,5 +327,5 @@ def _horizon(horizon: MotionHorizon, found: Intervals, truth: Array) -> HorizonA
         float(rotation),
         tuple(half.tolist()),
         (float(radii[0]), float(radii[1])),
-        *_nees(nees(off - found.bias[known], horizon.shape.covariance(found.scale[known]))),
+        *_nees(nees(off, horizon.shape.covariance(found.scale[known], found.bias[known]))),
     )

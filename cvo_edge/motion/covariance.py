@@ -8,9 +8,10 @@ has a mean of six, and is at most the chi-square quantile 12.6 (0.95) or 10.6 (0
 these say (Bar-Shalom, Li and Kirubarajan 2001, section 5.4). One covariance cannot do both jobs:
 
 ``interval``
-    of the motion over one horizon: Sigma = kappa U M U, with the scales u of the interval on the
-    diagonal of U, the correlation of scaled residuals M, and kappa such that 90 % of NEES are
-    at most 10.6. It is for gates and for single measurements.
+    of the motion over one horizon: Sigma = kappa U M U + b b^T, with the scales u of the interval
+    on the diagonal of U, the correlation of scaled residuals M, and kappa such that 90 % of the
+    first term's NEES are at most 10.6. The bias b, the middle of the interval, makes it the second
+    moment about the motion that is given. It is for gates and for single measurements.
 ``integrated``
     of one step, for a filter that adds steps up as if their errors were independent, which they
     are not: Q = diag(f u^2), with six factors f such that sums over 1, 2, 5 and 10 s are as large
@@ -62,10 +63,11 @@ class Shape(NamedTuple):
 
     matrix: Array
 
-    def covariance(self, scales: Array) -> Array:
-        """Return Sigma (m, 6, 6) of motions with scales (m, 8 or 6)."""
+    def covariance(self, scales: Array, bias: Array) -> Array:
+        """Return Sigma (m, 6, 6) of motions with scales (m, 8 or 6) and bias (m, 6)."""
         u = scales[:, :6]
-        return np.asarray(u[:, :, np.newaxis] * self.matrix * u[:, np.newaxis] + FLOOR)
+        about_bias = u[:, :, np.newaxis] * self.matrix * u[:, np.newaxis] + FLOOR
+        return np.asarray(about_bias + bias[:, :, np.newaxis] * bias[:, np.newaxis])
 
 
 def adjoint(steps: Array) -> Array:

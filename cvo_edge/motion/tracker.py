@@ -322,8 +322,12 @@ class MotionTracker:
         factors = None if self._factors is None else self._factors.T.tolist()
         covariances: list[tuple[float, ...] | UnsetType] = [UNSET] * len(radii)
         if self._of_motions:
-            every = zip(self.calibration.horizons, found.scale.T, strict=True)
-            own = [each.shape.covariance(scale[np.newaxis])[0] for each, scale in every]
+            own = [
+                each.shape.covariance(scale[np.newaxis], bias[np.newaxis])[0]
+                for each, scale, bias in zip(
+                    self.calibration.horizons, found.scale.T, found.bias.T, strict=True
+                )
+            ]
             fixed = in_fixed_axes(np.array(own), np.array(found.moved)[:, 3:])
             covariances = list(map(tuple, fixed.reshape(-1, 36).tolist()))
         motions = []
