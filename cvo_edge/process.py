@@ -23,6 +23,14 @@ from cvo_edge.output.lines import reopen_files
 
 # How long regular cleanup after a signal may take.
 _PATIENCE_S = 0.8
+# Signals that end a process silently by default, and mean nothing to this program.
+_MEANINGLESS = frozenset(
+    (
+        *(signal.SIGUSR1, signal.SIGUSR2, signal.SIGALRM, signal.SIGVTALRM, signal.SIGPROF),
+        *(signal.SIGIO, signal.SIGXCPU, getattr(signal, "SIGPWR", signal.SIGUSR1)),
+        *range(getattr(signal, "SIGRTMIN", 0), getattr(signal, "SIGRTMAX", -1) + 1),
+    )
+)
 # Names of the threads that may be blocked in a read when the program exits.
 _LEFT_BEHIND = ("cvo-edge reader", "cvo-edge worker")
 
@@ -49,9 +57,13 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
     """Run a command line and exit with the documented exit code.
 
     Every external error prints one line to stderr. A closed stdout pipe ends the program silently.
-    SIGINT and SIGTERM unwind the stack, so that sinks are flushed and closed.
+    SIGINT and SIGTERM unwind the stack, so that sinks are flushed and closed; so do signals that
+    have no meaning here, with one line.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    for number in _MEANINGLESS:
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _terminate)
     if sys.stdout is not None:
         # Escape characters that the terminal's character set lacks.
         with contextlib.suppress(AttributeError):
@@ -81,10 +93,12 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
         code = 128 + signal.SIGINT
     except Terminated as ended:
         code = int(ended.code or 0)
+        if code - 128 in _MEANINGLESS:
+            say(f"{program}: {_ended_by(code - 128)}")
     except SystemExit as leaving:
         # Ray replaces the exception that a signal raises while it waits.
-        if _terminated.is_set():
-            code = 128 + signal.SIGTERM
+        if _received:
+            code = 128 + _received[-1]
         # rich exits by itself if the reader of a help page has closed the pipe.
         elif isinstance(leaving.__context__, BrokenPipeError):
             code = 0
@@ -96,8 +110,8 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
         if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
             _leave(_complain(program, "this machine cannot start more threads", 1))
         # A C extension that is being imported replaces the exception that a signal raises.
-        if _terminated.is_set():
-            code = 128 + signal.SIGTERM
+        if _received:
+            code = 128 + _received[-1]
         elif not isinstance(error, OSError):
             raise
         else:
@@ -152,10 +166,11 @@ def _drop_stdout() -> None:
 
 
 class Terminated(SystemExit):
-    """Raised on SIGTERM and, in a terminal, SIGHUP, to close open files and end the process."""
+    """Raised on SIGTERM, meaningless signals and, in a terminal, SIGHUP, to close files and end."""
 
 
-_terminated = threading.Event()
+# Numbers of the signals that have raised it.
+_received: list[int] = []
 
 
 def follow_hang_ups() -> None:
@@ -183,8 +198,13 @@ def _has_terminal() -> bool:
 
 
 def _terminate(number: int, _: FrameType | None) -> NoReturn:
-    _terminated.set()
+    _received.append(number)
     raise Terminated(128 + number)
+
+
+def _ended_by(number: int) -> str:
+    name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+    return f"ended by {name}, a signal without a meaning here"
 
 
 @contextlib.contextmanager
@@ -211,7 +231,7 @@ def signals_deferred() -> Iterator[None]:
 
 
 def end_within_a_second() -> None:
-    """Make SIGINT and SIGTERM end this process within a second, even while C code runs.
+    """Make signals that end this process end it within a second, even while C code runs.
 
     Python runs its signal handlers only between bytecodes, so a hanging inference, decoder or read
     would delay them. Finished records are already written.
@@ -223,8 +243,12 @@ def end_within_a_second() -> None:
     def watch() -> None:
         while True:
             (number,) = os.read(receiver, 1)
-            if number in (signal.SIGINT, signal.SIGTERM):
+            # A command may give a signal a meaning of its own.
+            unasked = number in _MEANINGLESS and signal.getsignal(number) is _terminate
+            if unasked or number in (signal.SIGINT, signal.SIGTERM):
                 time.sleep(_PATIENCE_S)
+                if unasked:
+                    say(_ended_by(number))
                 os._exit(128 + number)
 
     with contextlib.suppress(RuntimeError):  # no thread: only Python's own handlers

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from cvo_edge.errors import UsageError
@@ -69,13 +71,18 @@ def checked_threads(threads: int | None) -> int:
     return threads or allowed_cores()
 
 
-def cores_of_threads(threads: int) -> list[int]:
+def cores_of_threads(threads: int, taken: Iterable[int] = ()) -> list[int]:
     """Return one core per inference thread, or an empty list to leave the threads unpinned.
 
     Threads are pinned only if there are as many threads as cores. Without pinning, the scheduler
-    often runs a woken thread on the core of the thread that woke it while another core is idle.
+    often runs a woken thread on the core of the thread that woke it while another core is idle. The
+    first core is the caller's: the one that is least often among those ``taken`` by other callers.
     """
     if threads < 2 or not hasattr(os, "sched_getaffinity"):
         return []
     cores = sorted(os.sched_getaffinity(0))
-    return cores if threads == len(cores) else []
+    if threads != len(cores):
+        return []
+    counts = Counter(taken)
+    first = min(cores, key=lambda core: counts[core])
+    return [first, *(core for core in cores if core != first)]

@@ -111,6 +111,8 @@ class Session:
         The bare ``onnxruntime.InferenceSession``, for comparison in benchmarks.
     inputs, outputs
         The tensors that the model declares.
+    caller_core
+        The core, if any, that the calling thread moves to during a call.
     forked
         Whether this process was forked from the one that loaded the model; it cannot run it.
 
@@ -121,6 +123,8 @@ class Session:
     BundleMismatchError
         Names, types or shapes differ from ``expected``.
     """
+
+    caller_core: frozenset[int] = frozenset()
 
     def __init__(
         self,
@@ -140,14 +144,15 @@ class Session:
         # keeps the speed within a call and releases the cores after it.
         options.add_session_config_entry("session.force_spinning_stop", "1")
         options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
-        self._caller_core: set[int] = set()
-        cores = cores_of_threads(self.threads)
+        others_of_process = [core for session in _OPEN for core in session.caller_core]
+        cores = cores_of_threads(self.threads, others_of_process)
         if cores:
+            self._cores = set(cores)
             # All cores but the caller's; onnxruntime counts them from one.
             others = ";".join(str(core + 1) for core in cores[1:])
             options.add_session_config_entry("session.intra_op_thread_affinities", others)
             # If threads sleep while they wait, the scheduler places the caller better.
-            self._caller_core = {cores[0]} if spinning else set()
+            self.caller_core = frozenset(cores[:1] if spinning else ())
         options.log_severity_level = 4
         if keep_in is not None:
             options.optimized_model_filepath = str(keep_in / GRAPH_FILE)
@@ -217,21 +222,24 @@ class Session:
 
     def _call(self, feeds: Mapping[str, NDArray[np.generic]]) -> Sequence[Any]:
         """Input arrays by name -> output arrays in the order of ``outputs``."""
-        if not self._caller_core:
+        if not self.caller_core:
             return self.engine.run(None, feeds)  # type: ignore[no-any-return]
-        # The calling thread runs on the one core that no inference thread is pinned to.
-        before = os.sched_getaffinity(0)
-        try:
-            os.sched_setaffinity(0, self._caller_core)
-        except OSError:
-            # This process may no longer use that core.
-            self._caller_core = set()
+        # The calling thread runs on the one core that no inference thread is pinned to, unless its
+        # owner has given it others since the model was loaded.
+        pinned = os.sched_getaffinity(0) == self._cores
+        if pinned:
+            try:
+                os.sched_setaffinity(0, self.caller_core)
+            except OSError:
+                # This process may no longer use that core.
+                pinned, self.caller_core = False, frozenset()
         try:
             return self.engine.run(None, feeds)  # type: ignore[no-any-return]
         finally:
-            if self._caller_core:
+            # Nor is a change undone that was made during the call.
+            if pinned and os.sched_getaffinity(0) == self.caller_core:
                 with contextlib.suppress(OSError):
-                    os.sched_setaffinity(0, before)
+                    os.sched_setaffinity(0, self._cores)
 
 
 def _tensors(ports: Sequence[Port], kind: str) -> tuple[TensorSpec, ...]:

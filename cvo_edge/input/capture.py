@@ -104,10 +104,17 @@ class Capture:
     """A video file, camera or stream that OpenCV reads, in one thread.
 
     A call that takes longer than ``timeout_s`` raises SourceError, and the device is abandoned;
-    opening may take twice as long.
+    opening may take twice as long. ``threads`` bounds those of a video decoder; by default FFmpeg
+    decides.
     """
 
-    def __init__(self, device: int | str, timeout_s: float, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(
+        self,
+        device: int | str,
+        timeout_s: float,
+        clock: Clock = SYSTEM_CLOCK,
+        threads: int | None = None,
+    ) -> None:
         hanging = sum(thread.is_alive() for thread in _hanging)
         if hanging >= _MOST_HANGING:
             raise SourceError(f"{shown(device)}: {hanging} earlier attempts still hang in OpenCV")
@@ -117,7 +124,7 @@ class Capture:
         self._idle = Event()
         self._closed = False
         # The thread holds no reference to this object, so that dropping it ends the thread.
-        arguments = (self._calls, self._answers, self._idle, clock)
+        arguments = (self._calls, self._answers, self._idle, clock, threads)
         thread = Thread(target=_work, args=arguments, name=READER, daemon=True)
         try:
             thread.start()
@@ -197,8 +204,9 @@ def _work(
     answers: SimpleQueue[object],
     idle: Event,
     clock: Clock,
+    threads: int | None,
 ) -> None:
-    opened = _Opened(cv2.VideoCapture(), clock)
+    opened = _Opened(cv2.VideoCapture(), clock, threads)
     while (call := calls.get()) is not None:
         try:
             answer = call(opened)
@@ -229,8 +237,8 @@ class _Stated(NamedTuple):
 class _Opened:
     """The capture and the ages of its frames; only the reading thread uses it."""
 
-    def __init__(self, capture: cv2.VideoCapture, clock: Clock) -> None:
-        self._capture, self._clock = capture, clock
+    def __init__(self, capture: cv2.VideoCapture, clock: Clock, threads: int | None) -> None:
+        self._capture, self._clock, self._threads = capture, clock, threads
         self._account = LagAccount(clock.now_s(), 0.0)
         self._driver: DriverStamps | None = None
         self._fresh_noise = True
@@ -240,7 +248,7 @@ class _Opened:
         begin = self._clock.now_s()
         try:
             with _written_to(device, wait_s):
-                if not self._capture.open(device):
+                if not self._open(device):
                     return None
             # As for image files: pixels in the sensor's order, whatever the container asks for.
             self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
@@ -254,6 +262,13 @@ class _Opened:
         self._driver = DriverStamps() if backend == "V4L2" else None
         self._fresh_noise = backend != "FFMPEG" or codec in _INTRA
         return _Stated(fps, int(count) if 0.0 < count < math.inf else 0, codec)
+
+    def _open(self, device: int | str) -> bool:
+        # Video4Linux refuses a parameter that is FFmpeg's.
+        if self._threads is None or isinstance(device, int) or Path(device).is_char_device():
+            return bool(self._capture.open(device))
+        limit = [cv2.CAP_PROP_N_THREADS, self._threads]
+        return bool(self._capture.open(device, cv2.CAP_ANY, limit))
 
     def grab(self) -> Grabbed | None:
         """Return the next image, None if there is none."""

@@ -48,6 +48,7 @@ def open_source(
     timeout_s: float = TIMEOUT_S,
     stamps: str | None = None,
     patience: Patience | None = None,
+    threads: int | None = None,
 ) -> Source:
     """Open a folder of images, a glob, a video file, a camera or a stream.
 
@@ -67,6 +68,8 @@ def open_source(
         or ``times.txt``, also for a video (see ``cvo_edge.input.stamps``).
     patience
         How long a camera is waited for, see ``Camera``.
+    threads
+        Most threads of a video's decoder; by default one per core.
 
     Raises
     ------
@@ -101,7 +104,8 @@ def open_source(
                 "whose frames are stamped as they arrive"
             )
         device = int(text) if text.isdecimal() else text
-        return Camera(device, fps, timeout_s, patience=patience)
+        reader = partial(Capture, threads=threads)
+        return Camera(device, fps, timeout_s, reader=reader, patience=patience)
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES or is_one_image(path):
             return ImageFiles(Listing("", [text], {}), fps, "", stamps)
@@ -111,7 +115,7 @@ def open_source(
                 "image files"
             )
         listed = None if stamps is None else ListedStamps(Path(stamps))
-        return Video(path, fps, timeout_s, listed)
+        return Video(path, fps, timeout_s, listed, threads)
     if glob.has_magic(text):
         found = [name for name in glob.iglob(text, recursive=True) if not os.path.isdir(name)]  # noqa: PTH112
         return ImageFiles(
@@ -161,10 +165,11 @@ class Video:
         fps: float | None,
         timeout_s: float = TIMEOUT_S,
         stamps: ListedStamps | None = None,
+        threads: int | None = None,
     ) -> None:
         check_video(path)
         self._path = path
-        self._capture = Capture(str(path), timeout_s)
+        self._capture = Capture(str(path), timeout_s, threads=threads)
         own_fps, announced = self._capture.open()
         self.length: int | None = announced if announced > 0 else None
         self._listed = stamps

@@ -58,7 +58,11 @@ class _Found:
     cpu_s: float = 0.0
     # From the first to the last frame, including the bare calls.
     all_s: float = 0.0
-    waited_s: float = 0.0
+    waited_s: float | None = None
+
+    def share_waited(self, threads: int) -> float | None:
+        """Return the share of the time of so many threads that was waited for a core."""
+        return None if self.waited_s is None else round(self.waited_s / (threads * self.all_s), 4)
 
 
 def benchmark(
@@ -100,7 +104,7 @@ def benchmark(
     session = odometer.session
     if session is None:  # pragma: no cover - just loaded
         raise UsageError("bench: expected an open odometer")
-    stream = _Endless(source, _still_size(odometer.calibration))
+    stream = _Endless(source, _still_size(odometer.calibration), threads)
     first = next(iter(stream))
     odometer.step(first.image)
     first_interval_ms = _process_age_ms()
@@ -125,9 +129,9 @@ def benchmark(
         "ratio_to_raw": {"median": round(float(np.median(found.ratios)), 4)},
         "throughput_fps": round(counted / found.wall_s, 1),
         "load_ms": round(load_ms, 1),
-        "first_interval_ms": round(first_interval_ms, 1),
+        "first_interval_ms": first_interval_ms,
         "cpu_ms_per_frame": round(1e3 * found.cpu_s / counted, 3),
-        "waited_for_cores": round(found.waited_s / (odometer.threads * found.all_s), 4),
+        "waited_for_cores": found.share_waited(odometer.threads),
         "memory_mib": memory_mib(),
         "environment": environment(odometer.threads),
     }
@@ -160,7 +164,7 @@ def _steps(
             found.wall_s += spent_s + 1e-3 * frame.read_ms
             found.cpu_s += cpu_s
     found.all_s = perf_counter() - all_begin
-    found.waited_s = waited_for_cores_s() - waited_s
+    found.waited_s = _since(waited_s)
     return found
 
 
@@ -199,7 +203,7 @@ def _streams(
                 found.ratios.append(whole_ms / float(np.median(raw_ms)))
         # Read before the stream ends, while its worker threads still exist.
         found.all_s = perf_counter() - all_begin
-        found.waited_s = waited_for_cores_s() - waited_s
+        found.waited_s = _since(waited_s)
     return found
 
 
@@ -229,9 +233,9 @@ def benchmark_lines(report: dict[str, Any]) -> list[str]:
         f"{report['ratio_to_raw']['median']:.3f}",
         f"{report['throughput_fps']:.0f} frames/s, {report['cpu_ms_per_frame']:.2f} CPU-ms "
         f"per frame, load {report['load_ms']:.0f} ms, first interval "
-        f"{report['first_interval_ms']:.0f} ms after process start",
+        f"{_number(report['first_interval_ms'])} ms after process start",
         *_remarks(report),
-        "memory MiB: " + ", ".join(f"{k} {v:.0f}" for k, v in report["memory_mib"].items()),
+        "memory MiB: " + ", ".join(f"{k} {_number(v)}" for k, v in report["memory_mib"].items()),
     ]
 
 
@@ -248,6 +252,15 @@ def _raw_ms(session: Session, feeds: dict[str, Any]) -> float:
     return 1e3 * (perf_counter() - begin)
 
 
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.0f}"
+
+
+def _since(waited_s: float | None) -> float | None:
+    now_s = waited_for_cores_s()
+    return None if now_s is None or waited_s is None else now_s - waited_s
+
+
 def _remarks(report: dict[str, Any]) -> list[str]:
     remarks = []
     if report["frames_skipped"]:
@@ -259,7 +272,12 @@ def _remarks(report: dict[str, Any]) -> list[str]:
         )
     if report["frames_in_alarm"]:
         remarks.append(f"{report['frames_in_alarm']} frames during an alarm: they have no interval")
-    if report["waited_for_cores"] > _BUSY_SHARE:
+    if report["first_interval_ms"] is None or report["waited_for_cores"] is None:
+        remarks.append(
+            "null where this system does not tell (no /proc): first interval, waiting for cores, "
+            "memory other than the peak"
+        )
+    elif report["waited_for_cores"] > _BUSY_SHARE:
         remarks.append(
             f"busy machine: {report['waited_for_cores']:.0%} of the time was spent waiting for a "
             "core used by other processes; fewer --threads may be faster"
@@ -272,9 +290,11 @@ class _Endless:
 
     length = None
 
-    def __init__(self, source: str | None, size: tuple[int, int]) -> None:
+    def __init__(
+        self, source: str | None, size: tuple[int, int], threads: int | None = None
+    ) -> None:
         self.still, self._size = source is None, size
-        self._source = source
+        self._source, self._threads = source, threads
         self.live = source is not None and names_camera(source)
         # One iterator for all callers, because many cameras serve a single client only.
         self._numbered = enumerate(self._again())
@@ -295,7 +315,7 @@ class _Endless:
             while True:
                 yield lambda: still
         while True:
-            reads = open_source(self._source).reads()
+            reads = open_source(self._source, threads=self._threads).reads()
             first = next(reads, None)
             if first is None:
                 raise SourceError(f"{shown(self._source)}: the source has no frames")
@@ -315,11 +335,11 @@ def _stamped(read: Callable[[], Frame], stamp_ns: int) -> Frame:
     return replace(read(), stamp_ns=stamp_ns)
 
 
-def _process_age_ms() -> float:
-    """Return the milliseconds since this process started, by the kernel's clock (0 if unknown)."""
+def _process_age_ms() -> float | None:
+    """Return the milliseconds since this process started, None if the kernel does not tell."""
     try:
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         uptime = time.clock_gettime(time.CLOCK_BOOTTIME)
-        return 1e3 * (uptime - int(fields[19]) / os.sysconf("SC_CLK_TCK"))
+        return round(1e3 * (uptime - int(fields[19]) / os.sysconf("SC_CLK_TCK")), 1)
     except (OSError, AttributeError, ValueError):
-        return 0.0
+        return None

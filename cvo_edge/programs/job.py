@@ -95,7 +95,9 @@ def opened(
     ``patience`` is for a camera, ``around`` opens a sink by its name and its opening, ``counts``
     are added to the metrics.
     """
-    frames = open_source(wanted.source, wanted.fps, wanted.timeout, wanted.stamps, patience)
+    frames = open_source(
+        wanted.source, wanted.fps, wanted.timeout, wanted.stamps, patience, wanted.threads
+    )
     with (
         Odometer.load(
             wanted.bundle,

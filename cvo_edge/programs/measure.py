@@ -9,7 +9,7 @@ import resource
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,32 +56,49 @@ def quantiles(values_ms: ArrayLike) -> dict[str, float]:
     return {name: round(value, 4) for name, value in found.items()}
 
 
-def memory_mib() -> dict[str, float]:
-    """Return peak, current and anonymous resident memory in MiB (0 if unknown)."""
-    kib = {"VmHWM": 0.0, "VmRSS": 0.0, "RssAnon": 0.0}
+class Memory(TypedDict):
+    """Peak, current and anonymous resident memory in MiB; None if the system does not tell."""
+
+    peak_rss: float
+    rss: float | None
+    anonymous: float | None
+
+
+def memory_mib() -> Memory:
+    """Return the memory of this process; without /proc, the peak alone is known."""
+    kib: dict[str, float | None] = {"VmHWM": None, "VmRSS": None, "RssAnon": None}
     try:
         for line in Path("/proc/self/status").read_text().splitlines():
             name, _, value = line.partition(":")
             if name in kib:
                 kib[name] = float(value.split()[0])
     except OSError:
-        # Without /proc only the peak is known, in KiB on Linux and bytes on macOS.
+        pass
+    peak = kib["VmHWM"]
+    if peak is None:
+        # In KiB on Linux and bytes on macOS.
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        kib["VmHWM"] = peak / 1024 if sys.platform == "darwin" else peak
+        peak = peak / 1024 if sys.platform == "darwin" else peak
     return {
-        "peak_rss": round(kib["VmHWM"] / 1024, 1),
-        "rss": round(kib["VmRSS"] / 1024, 1),
-        "anonymous": round(kib["RssAnon"] / 1024, 1),
+        "peak_rss": round(peak / 1024, 1),
+        "rss": _mib(kib["VmRSS"]),
+        "anonymous": _mib(kib["RssAnon"]),
     }
 
 
-def waited_for_cores_s() -> float:
-    """Return the seconds that this process's threads were ready but had no core (0 if unknown).
+def _mib(kib: float | None) -> float | None:
+    return None if kib is None else round(kib / 1024, 1)
+
+
+def waited_for_cores_s() -> float | None:
+    """Return the seconds that this process's threads were ready but had no core, None if unknown.
 
     Only existing threads count. The figure reveals load from other processes.
     """
-    waited_ns = 0
-    for path in Path("/proc/self/task").glob("*/schedstat"):
+    waited_ns, tasks = 0, list(Path("/proc/self/task").glob("*/schedstat"))
+    if not tasks:
+        return None
+    for path in tasks:
         # A thread may have ended meanwhile.
         with contextlib.suppress(OSError, ValueError, IndexError):
             waited_ns += int(path.read_text().split()[1])

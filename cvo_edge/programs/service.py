@@ -152,7 +152,7 @@ class Service:
             **self.figures(),
             "p50_ms": f"{latency['p50']:.1f}" if latency else "none",
             "p99_ms": f"{latency['p99']:.1f}" if latency else "none",
-            "rss_mib": round(memory_mib()["rss"] or 0),
+            "peak_mib": round(memory_mib()["peak_rss"]),
         }
         return "health: " + " ".join(f"{key}={value}" for key, value in words.items())
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from cvo_edge import Odometer, open_source, read_records
+from cvo_edge.programs.bench import benchmark, benchmark_lines
 
 CVO_EDGE = [sys.executable, "-c", "from cvo_edge.__main__ import main; main()"]
 # A script that runs the tests in the background makes their processes ignore SIGINT.
@@ -469,6 +470,34 @@ def test_bench_reports_the_documented_keys(bundle_dir, clip_dir, tmp_path, mode)
     assert (report["mode"], report["frames"], report["frames_valid"]) == (mode, 10, 10)
     assert set(report["memory_mib"]) == {"peak_rss", "rss", "anonymous"}
     assert f"mode {mode}: 10 frames after 2 warm-up" in result.stdout
+
+
+def test_what_a_system_does_not_tell_is_null_and_said(bundle_dir, monkeypatch):
+    """Without /proc, as in some sandboxes."""
+    hidden = lambda path: Path("/no/proc") / path.name if path.parts[1:2] == ("proc",) else path  # noqa: E731
+    read, found = Path.read_text, Path.glob
+    monkeypatch.setattr(Path, "read_text", lambda path, *a, **k: read(hidden(path), *a, **k))
+    monkeypatch.setattr(Path, "glob", lambda path, *a, **k: found(hidden(path), *a, **k))
+    report = benchmark(bundle_dir, frames=2, warmup=0)
+    assert (report["first_interval_ms"], report["waited_for_cores"]) == (None, None)
+    assert report["memory_mib"]["rss"] is None
+    assert report["memory_mib"]["peak_rss"] > 1.0
+    text = "\n".join(benchmark_lines(report))
+    assert "first interval unknown" in text
+    assert "no /proc" in text
+
+
+@pytest.mark.parametrize("name", ["SIGUSR1", "SIGRTMIN"])
+def test_a_signal_without_a_meaning_is_named_in_one_line(name):
+    number = int(getattr(signal, name))
+    script = (
+        "import signal, sys, typer; from cvo_edge.process import guarded; app = typer.Typer(); "
+        "app.command()(lambda number: signal.raise_signal(int(number))); guarded('cvo-edge', app)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(number)], capture_output=True, text=True, check=False
+    )
+    assert name in refused(done, 128 + number)
 
 
 def test_bench_gates_by_exit_8(bundle_dir, clip_dir):

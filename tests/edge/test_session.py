@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnxruntime
@@ -92,12 +93,39 @@ def test_a_callers_thread_is_where_it_was_after_an_inference(bundle, spinning):
     assert os.sched_getaffinity(0) == cores
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="Linux alone has it")
+def test_a_thread_that_its_owner_has_pinned_is_never_moved(bundle, monkeypatch):
+    """Neither one that was pinned since the model was loaded, nor one pinned during a call."""
+    mask, moves = [{4, 5}], []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(mask[0]))
+    monkeypatch.setattr(
+        os, "sched_setaffinity", lambda _, to: moves.append(to) or mask.insert(0, to)
+    )
+    loaded = session.Session(bundle.model_bytes, 1, bundle.calibration.model)
+    loaded.caller_core, loaded._cores = frozenset({4}), {4, 5}
+    loaded.engine = SimpleNamespace(run=lambda *_: [])
+    loaded._call({})
+    assert moves == [{4}, {4, 5}]
+    loaded.engine = SimpleNamespace(run=lambda *_: mask.insert(0, {5}))
+    loaded._call({})
+    assert mask[0] == {5}
+    moves.clear()
+    loaded._call({})
+    assert (mask[0], moves) == ({5}, [])
+
+
+def test_callers_of_two_models_have_a_core_each(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {2, 3, 7}, raising=False)
+    assert session.cores_of_threads(3, [2]) == [3, 2, 7]
+    assert session.cores_of_threads(3, [2, 3, 7, 2]) == [3, 2, 7]
+
+
 def test_a_core_that_is_taken_away_costs_the_pinning_alone(bundle):
     with Odometer(bundle, threads=1) as odometer:
         image = preprocess.selftest_image(192, 256)
         expected = odometer.observe(image, 0)
         # Simulate a control group that has removed the core since.
-        odometer.session._caller_core = {1023}
+        odometer.session.caller_core, odometer.session._cores = {1023}, os.sched_getaffinity(0)
         before = os.sched_getaffinity(0)
         for _ in range(2):
             found = odometer.observe(image, 0)

@@ -261,6 +261,22 @@ def test_a_damaged_frame_of_a_video_affects_no_other(video, damaged):
         assert np.array_equal(frames[seq].image, whole[seq].image)
 
 
+def test_the_threads_of_a_decoder_are_limited(tmp_path):
+    path = tmp_path / "a.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (64, 48))
+    for value in range(3):
+        writer.write(picture(value))
+    writer.release()
+    tasks = Path("/proc/self/task")
+    if not tasks.is_dir():
+        pytest.skip("threads are counted in /proc")
+    before = len(list(tasks.iterdir()))
+    frames = iter(open_source(path, threads=1))
+    next(frames)
+    assert len(list(tasks.iterdir())) <= before + 1, "a reader, and no thread of a decoder"
+    frames.close()
+
+
 def test_a_video_without_an_end_in_sight_ends(video):
     """A container that announces more frames than it holds is read a bounded number of times."""
     content = bytearray(video.read_bytes())
