@@ -28,6 +28,7 @@ _OURS = re.compile(
     rb"|#(?: kind: .*\n#)?(?: schema_version: .*\n#)? software: cvo-edge "
     rb"|\x89PNG\r\n\x1a\n.*Software\0cvo-edge "
     rb"|\x89MCAP0\r\n.{0,40}cvo-edge"
+    rb"|RRF2.{0,400}cvo-edge"
     rb"|<\?xml .*<dc:title>cvo-edge "
     # Of earlier versions, and tables.
     rb'|\{"seq":|seq,stamp_ns,|Position and half the width',

@@ -32,12 +32,10 @@ from cvo_edge.monitor.labelled import Labelled
 from cvo_edge.monitor.watch import StreamWatch
 from cvo_edge.pose import Pose
 from cvo_edge.processed import Processed
-from cvo_edge.record import Reason, Status
+from cvo_edge.record import Status
 from cvo_edge.scheduling import checked_mode, plan, run_stream
 from cvo_edge.sets import ConformalSet, unbounded_set
 from cvo_edge.vocabulary import Scope
-
-_STEEP_PITCH = np.deg2rad(80.0)
 
 
 class Odometer(Labelled):
@@ -337,7 +335,7 @@ class Odometer(Labelled):
             stamp_ns=frame.stamp_ns,
             source=frame.source,
             status=Status.INVALID if fault else Status.DEGRADED if doubts else Status.OK,
-            reasons=doubts or self._remarks(observation, found),
+            reasons=doubts or self._watch.remarks(observation, found),
             pose=None if fault else Pose(position_m, observation.pose[3:]),
             conformal_set=found,
             confidence=self.confidence,
@@ -367,13 +365,10 @@ class Odometer(Labelled):
         """Frames of the stream without fresh noise, whose equal parts prove no repetition."""
         return self._watch.unproven
 
-    def _remarks(self, observation: Observation, found: ConformalSet) -> tuple[Reason, ...]:
-        remarks: tuple[Reason, ...] = ()
-        if found.crossed:
-            remarks += (Reason.BOUNDS_CROSSED,)
-        if self.chart.rotation == "euler_zyx" and abs(observation.point[4]) > _STEEP_PITCH:
-            remarks += (Reason.PITCH_NEAR_90,)
-        return remarks + self._watch.remarks(observation)
+    @property
+    def image(self) -> NDArray[Any] | None:
+        """The image of the last estimate as its source gave it, e.g. for ``PoseInterval.draw``."""
+        return self._watch.image
 
     def observe(self, image_bgr: NDArray[Any] | None, seq: int) -> Observation:
         """Run the network on one image without applying a threshold; see ``Observer.observe``.

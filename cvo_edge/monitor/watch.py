@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Calibration
 from cvo_edge.camera_check import LensEstimate
@@ -12,6 +15,9 @@ from cvo_edge.input.frame import Frame, checked_hint
 from cvo_edge.input.frame_checks import StreamChecks
 from cvo_edge.monitor.alarm import StreamAlarm, false_alarms
 from cvo_edge.record import Reason
+from cvo_edge.sets import ConformalSet
+
+_STEEP_PITCH = np.deg2rad(80.0)
 
 
 class Verdict(NamedTuple):
@@ -36,9 +42,16 @@ class StreamWatch:
         The observer of the stream's frames.
     calibration
         That of its bundle.
+
+    Attributes
+    ----------
+    image
+        That of the last frame, as its source gave it.
     """
 
     def __init__(self, observer: Observer, calibration: Calibration) -> None:
+        self.image: NDArray[Any] | None = None
+        self._rotation = observer.chart.rotation
         self._checks = StreamChecks()
         self._sizes = observer.stream_sizes()
         self._camera = observer.camera_check()
@@ -46,6 +59,7 @@ class StreamWatch:
 
     def judge(self, observation: Observation, seq: int, frame: Frame, age_ms: float) -> Verdict:
         """Judge a frame by its own doubts and by the stream; ``age_ms`` is the frame's age."""
+        self.image = frame.image
         own = observation.doubt, observation.fault
         doubts = tuple(reason for reason in own if reason is not None)
         doubts += self._sizes.doubts(observation.look)
@@ -70,9 +84,14 @@ class StreamWatch:
             return False
         return self._camera.differs(observation.outputs, familiar=not doubts)
 
-    def remarks(self, observation: Observation) -> tuple[Reason, ...]:
-        """Return what is worth knowing of a frame that has an interval."""
-        return self._sizes.remarks(observation.look)
+    def remarks(self, observation: Observation, found: ConformalSet) -> tuple[Reason, ...]:
+        """Return what is worth knowing of a frame that has an interval, its set."""
+        remarks: tuple[Reason, ...] = ()
+        if found.crossed:
+            remarks += (Reason.BOUNDS_CROSSED,)
+        if self._rotation == "euler_zyx" and abs(observation.point[4]) > _STEEP_PITCH:
+            remarks += (Reason.PITCH_NEAR_90,)
+        return remarks + self._sizes.remarks(observation.look)
 
     @property
     def unproven(self) -> int:

@@ -20,7 +20,7 @@ import numpy as np
 
 from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
-from cvo_edge.output.messages import Message, Placement, ros_messages
+from cvo_edge.output.messages import Message, Placement, StoredImage, ros_image, ros_messages
 from cvo_edge.output.records import Header
 
 _PROFILE = "ros2"
@@ -222,12 +222,14 @@ class McapSink:
         if self._file is not None:
             self._file.__exit__(kind, error, traceback)
 
-    def write(self, estimate: PoseInterval, *more: Message) -> None:
-        """Write the messages of a frame, and ``more`` of the same time.
+    def write(self, estimate: PoseInterval, image: StoredImage | None = None) -> None:
+        """Write the messages of a frame, and its image as it is stored.
 
         Raises SinkError, and UsageError for a frame without a stamp.
         """
-        messages = [*ros_messages(estimate, self._placement, self._header.bundle), *more]
+        messages = [*ros_messages(estimate, self._placement, self._header.bundle)]
+        if image is not None:
+            messages.append(ros_image(estimate, self._placement, image))
         stamp_ns = estimate.stamp_ns or 0
         if self._file is None:
             # An old file is kept until there is a frame to put in its place.

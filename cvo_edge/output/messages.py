@@ -137,10 +137,18 @@ def ros_messages(estimate: PoseInterval, placement: Placement, bundle: str) -> I
     yield Message("/tf", TRANSFORM, {"transforms": [transform]})
 
 
-def ros_image(estimate: PoseInterval, placement: Placement, encoding: str, data: bytes) -> Message:
-    """Return the frame's image as it is stored; ``encoding`` is ``jpeg`` or ``png``."""
+class StoredImage(NamedTuple):
+    """An image as it is stored; ``encoding`` is ``jpeg`` or ``png``."""
+
+    encoding: str
+    data: bytes
+
+
+def ros_image(estimate: PoseInterval, placement: Placement, image: StoredImage) -> Message:
+    """Return the frame's image as it is stored."""
     header = ros_header(estimate, placement.child_frame_id)
-    return Message("/cvo/image", IMAGE, {"header": header, "format": encoding, "data": data})
+    content = {"header": header, "format": image.encoding, "data": image.data}
+    return Message("/cvo/image", IMAGE, content)
 
 
 def ros_header(estimate: PoseInterval, frame_id: str) -> Content:

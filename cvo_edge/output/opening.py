@@ -14,6 +14,9 @@ from cvo_edge.output.records import Header
 from cvo_edge.output.sinks import Sink
 from cvo_edge.vocabulary import Existing, Format
 
+# Formats of other programs: poses may be placed, and frames have their images.
+PLACED: tuple[Format, ...] = ("mcap", "rrd")
+
 
 class Writing(Protocol):
     """What writes estimates."""
@@ -39,17 +42,22 @@ def open_sink(
 
     Raises UsageError for a placement or a region that the format does not have, and SinkError.
     """
-    if format == "mcap":
-        # Imported here because its libraries are an extra.
-        from cvo_edge.output.mcap import McapSink
-
+    if format in PLACED:
         if region:
-            raise UsageError("region: expected the format jsonl, found mcap")
+            raise UsageError(f"region: expected the format jsonl, found {format}")
         check_output(path, force=existing == "force")
-        return McapSink(path, header, placement or Placement.of(header))
+        placement = placement or Placement.of(header)
+        # Imported here because their libraries are extras.
+        if format == "mcap":
+            from cvo_edge.output.mcap import McapSink
+
+            return McapSink(path, header, placement)
+        from cvo_edge.output.rerun import RerunSink
+
+        return RerunSink(path, header, placement)
     if placement is not None:
         raise UsageError(
-            f"frames: expected the format mcap with --base, --map, frame names or "
+            f"frames: expected the format {' or '.join(PLACED)} with --base, --map, frame names or "
             f"--unknown-variance, found {format}"
         )
     return Sink(path, format, header, region=region, existing=existing, told=told)

@@ -27,6 +27,7 @@ _SUFFIXES: dict[str, Format] = {
     ".csv": "csv",
     ".tum": "tum",
     ".mcap": "mcap",
+    ".rrd": "rrd",
 }
 _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
 
@@ -34,8 +35,8 @@ _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
 def format_of(path: str, format: Format | None = None) -> Format:
     """Return an output's format: as requested, or from the suffix of the path, or ``jsonl``.
 
-    Raises UsageError if the suffix (``.jsonl``, ``.csv``, ``.tum``, ``.mcap``) contradicts the
-    requested format.
+    Raises UsageError if the suffix (``.jsonl``, ``.csv``, ``.tum``, ``.mcap``, ``.rrd``)
+    contradicts the requested format.
     """
     of_suffix = _SUFFIXES.get(Path(path).suffix.lower())
     if format and of_suffix and format != of_suffix:

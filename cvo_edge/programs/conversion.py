@@ -9,9 +9,10 @@ from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.files import whole_path
 from cvo_edge.output.mcap import McapSink, recover
-from cvo_edge.output.messages import Message, Placement, ros_image
-from cvo_edge.output.opening import open_sink
+from cvo_edge.output.messages import Placement, StoredImage
+from cvo_edge.output.opening import PLACED, open_sink
 from cvo_edge.output.records import Header, estimate_of, read_records
+from cvo_edge.output.rerun import RerunSink
 from cvo_edge.pose import Pose
 from cvo_edge.vocabulary import Format
 
@@ -74,17 +75,16 @@ def convert(
             "none; records of older versions have to be made again"
         )
     placement = placement_of(header, base, map, frame_id, child_frame_id, unknown_variance)
-    if images is not None and format != "mcap":
-        raise UsageError(f"--images: expected the format mcap, found {format}")
+    if images is not None and format not in PLACED:
+        raise UsageError(f"--images: expected the format {' or '.join(PLACED)}, found {format}")
     with (
         whole_path(output) as name,
         open_sink(name, format, header, placement, existing="force") as sink,
     ):
         count = 0
         for estimate in _estimates(source, header):
-            if images is not None and isinstance(sink, McapSink):
-                place = placement or Placement.of(header)
-                sink.write(estimate, *_image(estimate, images, place))
+            if images is not None and isinstance(sink, McapSink | RerunSink):
+                sink.write(estimate, _image(estimate, images))
             else:
                 sink.write(estimate)
             count += 1
@@ -102,7 +102,7 @@ def _estimates(source: Path, first: Header) -> Iterator[PoseInterval]:
         yield estimate_of(record, first)
 
 
-def _image(estimate: PoseInterval, images: Path, placement: Placement) -> Iterator[Message]:
+def _image(estimate: PoseInterval, images: Path) -> StoredImage:
     path = images / estimate.source
     encoding = _ENCODINGS.get(path.suffix.lower())
     if encoding is None:
@@ -111,7 +111,7 @@ def _image(estimate: PoseInterval, images: Path, placement: Placement) -> Iterat
             f"file in {images}, as records of a folder have it"
         )
     try:
-        yield ros_image(estimate, placement, encoding, path.read_bytes())
+        return StoredImage(encoding, path.read_bytes())
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
 

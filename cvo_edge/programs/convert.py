@@ -13,7 +13,7 @@ from cvo_edge.process import say
 from cvo_edge.programs.options import ForceOption
 from cvo_edge.vocabulary import Format
 
-FRAMES = "Frames (mcap)"
+FRAMES = "Frames (mcap, rrd)"
 _POSE = "<tx,ty,tz,qx,qy,qz,qw>"
 
 BaseOption = Annotated[
@@ -76,16 +76,25 @@ def convert(
         ),
     ],
     output: Annotated[
-        str, typer.Option("-o", "--output", help="File to write: .mcap, .csv, .tum or .jsonl.")
-    ],
+        str | None,
+        typer.Option(
+            "-o",
+            "--output",
+            help="File to write: .mcap, .rrd, .csv, .tum or .jsonl; default: RECORDS with the "
+            "suffix of the format.",
+            show_default=False,
+        ),
+    ] = None,
     format: Annotated[
         Format | None,
-        typer.Option(help="Format; default: by the file's suffix.", show_default=False),
+        typer.Option(
+            "--to", "--format", help="Format; default: by the file's suffix.", show_default=False
+        ),
     ] = None,
     images: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the frames: add their images (mcap).",
+            help="Folder of the frames: add their images (mcap, rrd).",
             readable=False,
             show_default=False,
         ),
@@ -101,10 +110,14 @@ def convert(
     child_frame_id: ChildFrameIdOption = None,
     unknown_variance: UnknownVarianceOption = None,
 ) -> None:
-    """Write records as a file of another program, such as MCAP with messages of ROS 2."""
+    """Write records as a file of another program: ROS 2 messages (MCAP), rerun, CSV, TUM."""
     from cvo_edge.output.sinks import format_of
     from cvo_edge.programs import conversion
 
+    if output is None:
+        if format is None or format == "table":
+            raise UsageError("convert: expected -o FILE or --to with csv, tum, mcap or rrd")
+        output = str(source.with_suffix(f".{format}"))
     check_output(output, source, force=force)
     written_as = format_of(output, format)
     frames = (base, map, frame_id, child_frame_id, unknown_variance)

@@ -17,9 +17,11 @@ from cvo_edge.input.sources import open_source
 from cvo_edge.input.waiting import Patience
 from cvo_edge.odometer import Odometer
 from cvo_edge.output.mavlink import MavlinkSink
+from cvo_edge.output.messages import Placement
 from cvo_edge.output.metrics import Counts, MetricsSink
-from cvo_edge.output.opening import Writing, open_sink
+from cvo_edge.output.opening import PLACED, Writing, open_sink
 from cvo_edge.output.records import header_of
+from cvo_edge.output.rerun import RerunSink
 from cvo_edge.process import say
 from cvo_edge.programs.conversion import placement_of
 from cvo_edge.programs.options import model_cache
@@ -60,6 +62,7 @@ class Wanted:
     fps: float | None = None
     stamps: str | None = None
     adapt: bool = False
+    view: bool = False
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,9 @@ def _openings(
             "--mavlink: expected --map, the bundle's world in north, east, down, and --base, "
             "the vehicle's forward, right, down in the camera"
         )
+    if wanted.view:
+        where = placed or Placement.of(header)
+        yield "viewer", partial(RerunSink, None, header, where, lambda: odometer.image)
     yield (
         "records",
         partial(
@@ -150,7 +156,7 @@ def _openings(
             wanted.output,
             wanted.format,
             header,
-            placed if wanted.format == "mcap" or wanted.mavlink is None else None,
+            placed if wanted.format in PLACED or not (wanted.mavlink or wanted.view) else None,
             region=wanted.region,
             existing=wanted.existing,
             told=say,

@@ -30,7 +30,7 @@ def existing_file(append: bool, force: bool, format: str) -> Existing:
     """Return what happens to an output that exists; raises UsageError for a contradiction."""
     if append and force:
         raise UsageError("--append: expected it without --force, found both")
-    if append and format in ("csv", "mcap", "table"):
+    if append and format in ("csv", "mcap", "rrd", "table"):
         raise UsageError(f"--append: expected the format jsonl or tum, found {format}")
     return "append" if append else "force" if force else "replace"
 
@@ -119,8 +119,8 @@ OutputOption = Annotated[
 FormatOption = Annotated[
     Format | None,
     typer.Option(
-        help="Format of the records; default: by the file's suffix (.jsonl, .csv, .tum), else "
-        "jsonl.",
+        help="Format of the records; default: by the file's suffix (.jsonl, .csv, .tum, .mcap, "
+        ".rrd), else jsonl.",
         show_default=False,
         rich_help_panel=REPORT,
     ),

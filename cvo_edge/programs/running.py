@@ -81,6 +81,15 @@ def run(
     name: NameOption = None,
     mavlink: MavlinkOption = None,
     metrics: MetricsOption = None,
+    view: Annotated[
+        bool,
+        typer.Option(
+            "--view",
+            help="Also show frames, path, set and bands in the viewer rerun: one that listens on "
+            "port 9876 of this machine, or a new one if there is a display.",
+            rich_help_panel=REPORT,
+        ),
+    ] = False,
     base: BaseOption = None,
     map: MapOption = None,
     frame_id: FrameIdOption = None,
@@ -121,6 +130,7 @@ def run(
         state=state,
         mavlink=mavlink,
         metrics=metrics,
+        view=view,
         placing=(base, map, frame_id, child_frame_id, unknown_variance),
     )
     read = (source, bundle, public_key, camera, state, stamps)

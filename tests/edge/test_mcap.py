@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cvo_edge.errors import SourceError, UsageError
-from cvo_edge.output.messages import Placement, ros_image
+from cvo_edge.output.messages import Placement, StoredImage
 from cvo_edge.pose import Pose
 from cvo_edge.record import Status
 
@@ -30,7 +30,7 @@ def written(tmp_path_factory):
     path = tmp_path_factory.mktemp("mcap") / "a.mcap"
     with McapSink(str(path), HEADER, PLACE) as sink:
         for each in FRAMES:
-            sink.write(each, ros_image(each, PLACE, "jpeg", b"image %d" % each.seq))
+            sink.write(each, StoredImage("jpeg", b"image %d" % each.seq))
     return path
 
 
