@@ -21,6 +21,7 @@ PAGES = {
     "README.md": "index.md",
     "calibration_artifacts/README.md": "demonstration-bundles.md",
     "bench/results/README.md": "result-files.md",
+    "deploy/README.md": "deploy.md",
 }
 COPIES = "repository"
 _LINK = re.compile(r"(\]\()([^)#\s]+)((?:#[^)\s]*)?\))")

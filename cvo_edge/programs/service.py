@@ -136,6 +136,7 @@ class Service:
         return [
             *found,
             Count("cvo_camera_lost", "1 while the camera gives no frames.", lost, False),
+            Count("cvo_stuck", "1 while the watchdog is not fed.", float(self._stuck), False),
         ]
 
     def health(self) -> str:
