@@ -134,6 +134,21 @@ class PoseInterval:
         """
         return self.status is Status.OK and self.pose is not None and self.bounded
 
+    def about_pose(self) -> Bands:
+        """Return the disjoint intervals of each degree of freedom minus its estimate, m and rad.
+
+        Raises UsageError for an invalid frame.
+        """
+        point = self.chart.point(self._known_pose().to_array()).tolist()
+        rows = self.bands or tuple(
+            ((low, high),)
+            for low, high in zip(self.lower.tolist(), self.upper.tolist(), strict=True)
+        )
+        return tuple(
+            tuple((low - x, high - x) for low, high in row)
+            for row, x in zip(rows, point, strict=True)
+        )
+
     def covers(self, pose: Pose | ArrayLike) -> NDArray[np.bool_]:
         """Tell per DoF, (6,), whether the set holds a ``T_world_camera`` (Pose or shape (7,)).
 
@@ -273,16 +288,8 @@ class PoseInterval:
 
         vouched = None
         if self.pose is not None and self.vouched:
-            point = self.chart.point(self.pose.to_array()).tolist()
-            rows = self.bands or tuple(
-                ((low, high),)
-                for low, high in zip(self.lower.tolist(), self.upper.tolist(), strict=True)
-            )
-            pieces = [
-                [(low - x, high - x) for low, high in row]
-                for row, x in zip(rows, point, strict=True)
-            ]
-            vouched = overlay.Vouched(self.chart.dof, pieces, self.pose.to_matrix()[:3, :3].T)
+            R = self.pose.to_matrix()[:3, :3]
+            vouched = overlay.Vouched(self.chart.dof, self.about_pose(), R.T)
         return overlay.draw(image, self.to_record(), vouched)
 
     def __str__(self) -> str:

@@ -26,7 +26,7 @@ _GREEN, _ORANGE, _RED, _WHITE = (90, 210, 90), (0, 165, 255), (70, 70, 240), (23
 _DIM = (150, 150, 150)
 _AXES: tuple[tuple[str, Colour], ...] = (("x", _RED), ("y", _GREEN), ("z", (255, 150, 60)))
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_TO_CM_OR_DEG = (100.0,) * 3 + (math.degrees(1.0),) * 3
+TO_CM_OR_DEG = (100.0,) * 3 + (math.degrees(1.0),) * 3
 # Lines of text are this share of the image's height, but never too small to read.
 _LINE_SHARE, _LEAST_LINE_PX = 1 / 24, 13
 _LEAST_SIDE = 16
@@ -139,10 +139,10 @@ class _Pen:
         for column, unit in enumerate(("cm", "deg")):
             rows = range(3 * column, 3 * column + 3)
             scaled = [
-                [_TO_CM_OR_DEG[row] * np.array(p) for p in vouched.pieces[row]] for row in rows
+                [TO_CM_OR_DEG[row] * np.array(p) for p in vouched.pieces[row]] for row in rows
             ]
             reach = max(float(np.abs(piece).max()) for row in scaled for piece in row)
-            full = _round_up(reach)
+            full = round_up(reach)
             left = 2 * self._edge + column * (self._width // 2)
             base = top + self._line - self._line // 5
             right = left + self._width // 2 - 3 * self._edge
@@ -206,7 +206,7 @@ class _Pen:
         part[:] = part // 4
 
 
-def _round_up(value: float) -> float:
+def round_up(value: float) -> float:
     """Return the next of 1, 2, 5, 10, ... times a power of ten."""
     if not 0.0 < value < 1e12:
         return 1.0

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
+from cvo_edge.estimate import PoseInterval
 from cvo_edge.programs.run import RunSummary
 from cvo_edge.record import Status
 
@@ -76,7 +77,7 @@ class FramesProgress(_Line):
         super().__init__(stream, clock)
         self._summary, self._total = summary, total
 
-    def tick(self) -> None:
+    def tick(self, _: PoseInterval | None = None) -> None:
         """Update the line if it is due; call this once per frame."""
         now = self._clock()
         if self._due(now):
@@ -119,8 +120,8 @@ class ItemsProgress(_Line):
 @contextmanager
 def frames_progress(
     wanted: bool, summary: RunSummary, length: int | None, max_frames: int | None
-) -> Iterator[Callable[[], None]]:
-    """Yield a function to call once per frame; it does nothing if stderr is not a terminal."""
+) -> Iterator[Callable[[PoseInterval], None]]:
+    """Yield a function to call with each frame; it does nothing if stderr is not a terminal."""
     stream = sys.stderr
     if not wanted or stream is None or not stream.isatty():
         yield _nothing
@@ -147,7 +148,7 @@ def items_progress() -> Iterator[Callable[[str, int, int], None] | None]:
         progress.close()
 
 
-def _nothing() -> None:
+def _nothing(_: PoseInterval | None = None) -> None:
     """Do nothing."""
 
 

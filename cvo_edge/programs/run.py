@@ -220,12 +220,12 @@ def run(
     labels: Labels | None = None,
     max_frames: int | None = None,
     expect_motion: bool = False,
-    tick: Callable[[], None] | None = None,
+    tick: Callable[[PoseInterval], None] | None = None,
 ) -> None:
     """Estimate all ``frames``; write each estimate and count it in ``summary``.
 
     The caller owns the summary and can show it even if the source ends early. With
-    ``expect_motion``, a picture that stands still is a doubt. ``tick`` is called after each frame.
+    ``expect_motion``, a picture that stands still is a doubt. ``tick`` gets each frame at last.
     The odometer gets the labels whose time has come after each estimate.
     """
     if isinstance(frames, ImageFiles):
@@ -239,7 +239,7 @@ def run(
                 if labels is not None:
                     labels.after(estimate)
                 if tick is not None:
-                    tick()
+                    tick(estimate)
     finally:
         summary.camera = odometer.seen_camera
         summary.unproven = odometer.unproven_frames

@@ -90,6 +90,14 @@ def run(
             rich_help_panel=REPORT,
         ),
     ] = False,
+    preview: Annotated[
+        bool,
+        typer.Option(
+            "--preview",
+            help="Show status, pose and bands of the running odometer on this terminal.",
+            rich_help_panel=REPORT,
+        ),
+    ] = False,
     base: BaseOption = None,
     map: MapOption = None,
     frame_id: FrameIdOption = None,
@@ -102,6 +110,7 @@ def run(
     from cvo_edge.output.sinks import format_of
     from cvo_edge.programs.job import Wanted, opened
     from cvo_edge.programs.labels import Labels
+    from cvo_edge.programs.preview import frames_preview
     from cvo_edge.programs.progress import frames_progress
     from cvo_edge.programs.run import run as run_frames
 
@@ -139,9 +148,12 @@ def run(
     truth = None if ground_truth is None else open_ground_truth(ground_truth, source)
     labelled = None if labels is None else open_ground_truth(labels, source)
     with opened(wanted, truth=truth) as job:
-        summary, watched = job.summary, output != "-" and not quiet
+        summary, length = job.summary, job.frames.length
+        watching = frames_progress(output != "-" and not quiet, summary, length, max_frames)
+        if preview:
+            watching = frames_preview(summary, length, records_here=output == "-")
         try:
-            with frames_progress(watched, summary, job.frames.length, max_frames) as tick:
+            with watching as tick:
                 run_frames(
                     job.odometer,
                     job.frames,
