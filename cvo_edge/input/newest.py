@@ -67,7 +67,8 @@ class Newest:
                     read_s = 1e-3 * frame.read_ms
                     frame = replace(frame, arrived_s=self._clock.now_s() - read_s)
                 with self._changed:
-                    self._skipped += self._frame is not None
+                    # A source may have dropped frames itself.
+                    self._skipped += frame.skipped + (self._frame is not None)
                     self._frame = frame
                     self._changed.notify()
                 if self._closed:

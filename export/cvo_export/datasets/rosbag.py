@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import SourceError
-from cvo_edge.input.bag_images import image_topic, message_size
+from cvo_edge.input.bag_images import image_topic
+from cvo_edge.input.ros_images import message_image, message_size
 from cvo_edge.trajectories.bag import Bag, find_bags
 from cvo_edge.trajectories.bag_poses import OPTIONS, camera_poses
 from cvo_edge.trajectories.bag_transforms import frame_name
@@ -27,7 +28,7 @@ from cvo_edge.trajectories.interpolation import Stamps
 from cvo_edge.trajectories.path_options import path_options
 from cvo_edge.trajectories.poses import matrix_to_pose
 from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS
-from cvo_export.datasets.bag_images import bag_camera, message_image
+from cvo_export.datasets.bag_cameras import bag_camera
 from cvo_export.datasets.base import PoseDataset, skipped_text
 from cvo_export.datasets.folders import only_camera
 

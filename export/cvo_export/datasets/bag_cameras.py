@@ -1,57 +1,15 @@
-"""Images and cameras of ROS bags: ``sensor_msgs/Image``, ``CompressedImage``, ``CameraInfo``."""
+"""Cameras of ROS bags: ``sensor_msgs/CameraInfo``."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-from cvo_edge.camera import Distortion
 from cvo_edge.errors import SourceError
-from cvo_edge.input.bag_images import FORMS, message_size
-from cvo_edge.input.decoding import decode_image
+from cvo_edge.input.ros_images import lens_of, pinhole_of
 from cvo_edge.trajectories.bag import Bag
 from cvo_export.datasets.base import NO_DISTORTION, Intrinsics, Lens
 
-Image = NDArray[np.uint8]
-
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-
-
-_MODELS: dict[str, Distortion] = {
-    "plumb_bob": "radial_tangential",
-    "rational_polynomial": "radial_tangential",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-}
-
-
-def message_image(message: Any) -> Image | None:
-    """Return the image in a message, (height, width, 3) BGR; None if it cannot be decoded.
-
-    16 bits keep their upper eight, as in ``decode_image``.
-    """
-    if not hasattr(message, "encoding"):
-        return decode_image(message.data.tobytes())
-    size = message_size(message)
-    if size is None:
-        return None
-    form, (height, width) = FORMS[message.encoding], size
-    rows = message.data[: message.step * height].reshape(height, message.step)
-    pixels = np.ascontiguousarray(rows[:, : width * form.channels * form.depth])
-    if form.depth == 2:
-        wide = pixels.view(">u2" if message.is_bigendian else "<u2")
-        pixels = (wide >> 8).astype(np.uint8)
-    if form.channels > 1:
-        pixels = pixels.reshape(height, width, form.channels)
-    if form.conversion is None:
-        return pixels
-    try:
-        return np.asarray(cv2.cvtColor(pixels, form.conversion), np.uint8)
-    except cv2.error:
-        return None
 
 
 def bag_camera(
@@ -102,21 +60,12 @@ def _fits(info: Any, frame: str, size: tuple[int, int]) -> bool:
 
 def _camera(bag: Bag, topic: str, images: str) -> tuple[Intrinsics, Lens] | None:
     info = bag.first(topic)
-    # ROS 1 names the matrices by capital letters.
-    K, D, P = (
-        np.asarray(getattr(info, name, getattr(info, name.upper(), ())), dtype=np.float64)
-        for name in "kdp"
-    )
     rectified = "rect" in images.removesuffix("/compressed").rpartition("/")[2]
-    values = P[[0, 5, 2, 6]] if rectified else K[[0, 4, 2, 5]]
-    if not values[:2].any():
+    values = pinhole_of(info, rectified=rectified)
+    if values is None:
         return None
     intrinsics = Intrinsics(*values.tolist()).checked(f"{bag.path}: {topic}")
-    if rectified or not D.any():
+    found = None if rectified else lens_of(info)
+    if rectified or (found is not None and found[0] == "none"):
         return intrinsics, NO_DISTORTION
-    model = _MODELS.get(info.distortion_model)
-    count = 4 if model == "equidistant" else 5 if D.size <= 5 else 8
-    if model is None or D[count:].any() or not np.isfinite(D).all():
-        return None
-    numbers = np.pad(D[:count], (0, max(0, count - D.size)))
-    return intrinsics, Lens(model, tuple(numbers.tolist()))
+    return None if found is None else (intrinsics, Lens(*found))
