@@ -249,19 +249,22 @@ def own_folder(variable: str, base_variable: str, base: str) -> Path:
         return Path(os.devnull) / "cvo-edge"
 
 
-def check_output(output: str | Path, *inputs: str | Path | None, force: bool = False) -> None:
+def check_output(
+    output: str | Path, *inputs: str | Path | None, force: bool | None = False
+) -> None:
     """Raise UsageError for an output that must not be replaced.
 
     That is an input, a file in an input's folder or glob, and, without ``force``, a file that this
-    program did not write. Neither needs to exist: some inputs are written, too. Empty files, pipes
-    and devices are never refused.
+    program did not write; None says that a command has no such option. Neither needs to exist: some
+    inputs are written, too. Empty files, pipes and devices are never refused.
     """
     output = str(output)
     if output == "-":
         return
     _refuse_inputs(output, inputs)
     if not force:
-        _refuse_foreign(output)
+        advice = "choose another name" + ("" if force is None else ", or --force to replace it")
+        _refuse_foreign(output, advice)
 
 
 def _refuse_inputs(output: str, inputs: Iterable[str | Path | None]) -> None:
@@ -282,7 +285,7 @@ def _refuse_inputs(output: str, inputs: Iterable[str | Path | None]) -> None:
             raise UsageError(f"output: expected a new file, found {output} among the inputs")
 
 
-def _refuse_foreign(output: str) -> None:
+def _refuse_foreign(output: str, advice: str) -> None:
     try:
         with Path(output).open("rb", buffering=0) as stream:
             found = os.fstat(stream.fileno())
@@ -299,8 +302,7 @@ def _refuse_foreign(output: str) -> None:
         return
     if beginning and not ours:
         raise UsageError(
-            f"{output}: expected a new file or one of cvo-edge, found another one; choose another "
-            "name, or --force to replace it"
+            f"{output}: expected a new file or one of cvo-edge, found another one; {advice}"
         )
 
 

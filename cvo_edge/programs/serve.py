@@ -117,7 +117,7 @@ def serve(
         metrics=metrics,
         placing=(base, map, frame_id, child_frame_id, unknown_variance),
     )
-    check_output(output, source, bundle, public_key, camera, state)
+    check_output(output, source, bundle, public_key, camera, state, force=None)
     waiting, notifier = Waiting(say), Notifier()
     service = Service(waiting, notifier, say, health_every)
 

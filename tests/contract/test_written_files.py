@@ -46,11 +46,13 @@ SUFFIXES = {
     ("run", "output"): (".jsonl", ".csv", ".tum", ".mcap"),
     ("odometry", "output"): (".jsonl", ".tum"),
     ("annotate", "output"): (".jsonl", ".csv", ".tum"),
-    ("convert", "output"): (".jsonl", ".csv", ".tum", ".mcap"),
+    ("convert", "output"): (".jsonl", ".csv", ".tum", ".mcap", ".rrd"),
     ("plot", "out"): (".pdf",),
     ("dataset", "picture"): (".svg",),
 }
-EXTRAS = {".mcap": "mcap", ".svg": "matplotlib", ".pdf": "matplotlib"}
+# A service adds to its file and replaces none.
+ADDED_TO = {("serve", "output"): f"serve {BUNDLE} /dev/video9 -o OUT"}
+EXTRAS = {".rrd": "rerun", ".mcap": "mcap", ".svg": "matplotlib", ".pdf": "matplotlib"}
 CASES = [
     (key, command, suffix)
     for key, command in WRITERS.items()
@@ -97,7 +99,17 @@ def names(app):
 
 
 def test_every_option_that_names_an_output_is_tested_here():
-    assert names(edge) | names(export) == set(WRITERS)
+    assert names(edge) | names(export) == set(WRITERS) | set(ADDED_TO)
+
+
+@pytest.mark.parametrize("content", FOREIGN.values(), ids=FOREIGN)
+def test_a_service_adds_to_no_foreign_file(content, tmp_path):
+    path = tmp_path / "out.jsonl"
+    path.write_bytes(content)
+    for command in ADDED_TO.values():
+        with pytest.raises(UsageError, match=r"choose another name$"):
+            edge(command.replace("OUT", str(path)).split(), standalone_mode=False)
+    assert path.read_bytes() == content
 
 
 @pytest.mark.parametrize(
