@@ -22,6 +22,7 @@ import numpy as np
 from played import CONFIDENCE, Array, Subject, by_recording, remembered
 from provenance import write_result
 
+from cvo_edge.bundle.quantiles import threshold_at
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.odometer import Odometer
 from cvo_edge.record import Reason
@@ -58,9 +59,9 @@ class Frames:
         self.given.append((odometer.step(image), truth))
         if seen.fault is not None or seen.doubt in UNUSABLE:
             return
-        stored = odometer.calibration.stored_threshold
-        self.marginal.append(odometer.conformal_set(seen, stored(CONFIDENCE, "marginal")))
-        self.joint.append(odometer.conformal_set(seen, stored(CONFIDENCE, "joint")))
+        for scope, sets in (("marginal", self.marginal), ("joint", self.joint)):
+            threshold = threshold_at(odometer.calibration, CONFIDENCE, scope)
+            sets.append(odometer.conformal_set(seen, threshold))
         self.point.append(seen.point)
         self.truth.append(odometer.chart.coordinates(truth, seen.pose))
 

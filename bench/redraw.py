@@ -27,7 +27,7 @@ from cvo_edge.odometer import Odometer
 from cvo_edge.vocabulary import Rule
 from cvo_export.bundles.observed import Observed, Scored, observe
 from cvo_export.bundles.rule import DEFAULT_CAP
-from cvo_export.bundles.thresholds import thresholds
+from cvo_export.bundles.thresholds import Quantiles
 from cvo_export.data.splits import same_split
 from cvo_export.datasets import open_dataset
 
@@ -53,7 +53,7 @@ def deal_figures(
     """Return the figures of one deal by scope; none for a scope with an unbounded threshold."""
     found: dict[str, Figures] = {}
     cap = DEFAULT_CAP if rule == "capped" else None
-    for entry in thresholds(head, cal, val, rule, "max", cap):
+    for entry in Quantiles(head, cal, val, rule, "max", cap).entries():
         if entry.confidence != CONFIDENCE or None in entry.q_hat:
             continue
         sets = test.sets(head, entry)

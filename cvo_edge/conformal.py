@@ -6,6 +6,7 @@ This module holds every formula that turns scores into thresholds or sets into f
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -50,11 +51,14 @@ def conformal_quantile(scores: ArrayLike, confidence: float) -> float:
 
     Raises UsageError for NaN scores.
     """
-    values = _checked(scores)
-    k = conformal_rank(values.size, confidence)
-    if k > values.size:
-        return math.inf
-    return float(np.partition(values, k - 1)[k - 1])
+    return float(conformal_quantiles(scores, [confidence])[0])
+
+
+def conformal_quantiles(scores: ArrayLike, confidences: Sequence[float]) -> Array:
+    """Return ``conformal_quantile`` of scores (n,) at each of m confidences, (m,)."""
+    values = np.append(np.sort(_checked(scores)), np.inf)
+    ranks = [conformal_rank(values.size - 1, each) for each in confidences]
+    return np.asarray(values[np.minimum(ranks, values.size) - 1])
 
 
 def capped_quantile(scores: ArrayLike, sequence: ArrayLike, confidence: float, cap: float) -> float:
@@ -73,6 +77,13 @@ def capped_quantile(scores: ArrayLike, sequence: ArrayLike, confidence: float, c
 
     Raises UsageError for NaN scores and for a cap outside (0, 1].
     """
+    return float(capped_quantiles(scores, sequence, [confidence], cap)[0])
+
+
+def capped_quantiles(
+    scores: ArrayLike, sequence: ArrayLike, confidences: Sequence[float], cap: float
+) -> Array:
+    """Return ``capped_quantile`` of scores (n,) at each of m confidences, (m,)."""
     values = _checked(scores)
     if not 0.0 < cap <= 1.0:
         raise UsageError(f"cap: expected a number above 0 and at most 1, found {cap}")
@@ -83,9 +94,9 @@ def capped_quantile(scores: ArrayLike, sequence: ArrayLike, confidence: float, c
     weights = 1.0 / ((sizes.size + 1) * sizes[group])
     order = np.argsort(values, kind="stable")
     cumulative = np.cumsum(weights[order])
-    target = confidence - (1.0 - cap) / (sizes.size + 1)
-    index = int(np.searchsorted(cumulative, target - _RANK_TOLERANCE))
-    return float(values[order[index]]) if index < values.size else math.inf
+    targets = np.asarray(confidences) - (1.0 - cap) / (sizes.size + 1)
+    found = np.searchsorted(cumulative, targets - _RANK_TOLERANCE)
+    return np.append(values[order], np.inf)[found]
 
 
 def recording_cap(rule: Rule, cap: float | None) -> float | None:

@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
@@ -31,7 +31,7 @@ _LONGEST = 160
 def decode_document(
     content: bytes,
     kind: type[Document],
-    version: int,
+    versions: Sequence[int],
     where: str,
     check: Callable[[Document], None],
 ) -> Document:
@@ -43,9 +43,10 @@ def decode_document(
     try:
         document = _parse_json(content)
         found = document.get("schema_version")
-        if type(found) is not int or found != version:
+        if type(found) is not int or found not in versions:
             raise CalibrationFileError(
-                f"schema_version: expected {version}, found {shown(found)}; "
+                f"schema_version: expected {' or '.join(map(str, versions))}, found "
+                f"{shown(found)}; "
                 "a newer file needs a newer cvo-edge"
             )
         _check_digest(content)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Threshold
+from cvo_edge.bundle.quantiles import threshold_at
 from cvo_edge.camera import Camera, checked_camera
 from cvo_edge.camera_check import LensEstimate
 from cvo_edge.engine.loading import Bundle, read_bundle
@@ -55,7 +56,7 @@ class Odometer(Labelled):
     mode
         ``latency``, ``throughput`` or ``live``, see ``cvo_edge.scheduling``.
     confidence
-        One of the confidences stored in the bundle.
+        One that the bundle stores, or any if it holds quantiles of its calibration scores.
     scope
         ``marginal``: the confidence holds for each degree of freedom; ``joint``: for all six at
         once.
@@ -70,8 +71,7 @@ class Odometer(Labelled):
     Raises
     ------
     UsageError
-        A confidence that is not stored, an unknown scope or mode, or a camera whose images cannot
-        be brought to the view of the bundle's own.
+        A confidence, scope or mode that there is not, or a camera that does not fit the bundle's.
     ModelError, BundleMismatchError
         The engine refuses the model.
     """
@@ -91,7 +91,7 @@ class Odometer(Labelled):
         calibration = bundle.calibration
         self.calibration = calibration
         self.head = bundle.head
-        self.threshold = calibration.stored_threshold(confidence, scope)
+        self.threshold = threshold_at(calibration, confidence, scope)
         self.confidence = self.threshold.confidence
         self.scope = scope
         self.mode = checked_mode(mode)

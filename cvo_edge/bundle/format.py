@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
 
 from cvo_edge.camera import LEAST_SIDE, Camera
-from cvo_edge.documents import one_line, shown
-from cvo_edge.errors import CalibrationFileError, UsageError
+from cvo_edge.documents import one_line
+from cvo_edge.errors import CalibrationFileError
 from cvo_edge.pose import Rotation
 from cvo_edge.vocabulary import Crop, Joint, Precision, Provider, Rule, Scope, SplitKind
 
 CALIBRATION_FILE = "calibration.json"
 MODEL_FILE: Literal["model.onnx"] = "model.onnx"
 # Tolerance for confidences in single precision, e.g. numpy.float32(0.9).
-_SAME_CONFIDENCE = 1e-7
+SAME_CONFIDENCE = 1e-7
 # Every bundle stores at least these confidences, for both scopes.
 CONFIDENCES = (0.5, 0.8, 0.9, 0.95, 0.99)
 
@@ -167,6 +167,24 @@ class Threshold(_Strict, frozen=True, omit_defaults=True):
     left_out: LeftOut | None = None
 
 
+# The quantiles of one degree of freedom and side at ascending confidences.
+Column = tuple[NumberOrNone, ...]
+
+
+class QuantileTable(_Strict, frozen=True):
+    """Thresholds at ascending ``confidences``, see ``cvo_edge.bundle.quantiles``.
+
+    Each scope has six columns, twelve with two sides (lower ones first), or one for each side if
+    all six are equal; a column is null if it is unbounded at every confidence.
+    """
+
+    confidences: Annotated[
+        tuple[Annotated[float, Meta(gt=0, le=1 - 1e-9)], ...], Meta(min_length=1)
+    ]
+    marginal: tuple[Column | None, ...]
+    joint: tuple[Column | None, ...]
+
+
 class SplitSpec(_Strict, frozen=True):
     """Assignment of frames to roles, so that the test frames can be reproduced.
 
@@ -272,15 +290,16 @@ class ImageSpec(_Strict, frozen=True):
 
 
 class Calibration(_Strict, frozen=True, omit_defaults=True):
-    """The contents of ``calibration.json``, version 1.
+    """The contents of ``calibration.json``: version 1, or 2 with ``quantiles``.
 
     ``camera``: intrinsics of the calibration images' camera; null if the data set does not state
     them. ``images``: their size and colour; null in bundles of earlier releases. ``alarm``: when a
     stream's images are no longer like those of the calibration; null if the graph does not tell.
     ``difficulty``: what scales the sets of the thresholds from frame to frame; null for nothing.
+    ``quantiles``: thresholds at many more confidences; null in bundles of earlier releases.
     """
 
-    schema_version: Literal[1]
+    schema_version: Literal[1, 2]
     name: Text
     method: Text
     model: ModelSpec
@@ -296,6 +315,7 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
     images: ImageSpec | None = None
     alarm: AlarmSpec | None = None
     difficulty: DifficultySpec | None = None
+    quantiles: QuantileTable | None = None
 
     def threshold(self, confidence: float, scope: Scope) -> Threshold | None:
         """Return the stored threshold for this confidence and scope, or None.
@@ -304,31 +324,10 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
         """
         for entry in self.thresholds:
             if entry.scope == scope and math.isclose(
-                entry.confidence, confidence, abs_tol=_SAME_CONFIDENCE
+                entry.confidence, confidence, abs_tol=SAME_CONFIDENCE
             ):
                 return entry
         return None
-
-    def stored_threshold(self, confidence: float, scope: Scope) -> Threshold:
-        """Return the stored threshold; raises UsageError that lists the stored confidences."""
-        if scope not in get_args(Scope):
-            raise UsageError(
-                f"scope: expected one of {', '.join(get_args(Scope))}, found {shown(scope)}"
-            )
-        try:
-            wanted = float(confidence)
-        except (TypeError, ValueError):
-            raise UsageError(f"confidence: expected a number, found {shown(confidence)}") from None
-        found = self.threshold(wanted, scope)
-        if found is not None:
-            return found
-        stored = self.confidences(scope)
-        nearest = [*[c for c in stored if c < wanted][-1:], *[c for c in stored if c > wanted][:1]]
-        raise UsageError(
-            f"confidence: {wanted:g} is not stored in the bundle for the {scope} scope; nearest: "
-            f"{' and '.join(f'{c:g}' for c in nearest) or 'none'}; stored: "
-            f"{', '.join(f'{c:g}' for c in stored) or 'none'}"
-        )
 
     def confidences(self, scope: Scope) -> tuple[float, ...]:
         """Return the confidences stored for this scope, ascending."""

@@ -16,7 +16,7 @@ from cvo_edge.documents import decode_document, encode_document
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, ModelError
 from cvo_edge.files import read_regular_file, regular_file
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSIONS = (1, 2)
 MAX_CALIBRATION_BYTES = 64 * 1024
 MAX_MODEL_BYTES = 1 << 30
 
@@ -78,7 +78,7 @@ def decode_calibration(content: bytes, where: str = CALIBRATION_FILE) -> Calibra
 
     Raises CalibrationFileError.
     """
-    return decode_document(content, Calibration, SCHEMA_VERSION, where, check_rules)
+    return decode_document(content, Calibration, SCHEMA_VERSIONS, where, check_rules)
 
 
 def encode_calibration(calibration: Calibration) -> bytes:

@@ -13,6 +13,7 @@ from cvo_edge.bundle.format import (
     TensorSpec,
     Threshold,
 )
+from cvo_edge.bundle.quantiles import check_quantiles
 from cvo_edge.documents import shown
 from cvo_edge.errors import CalibrationFileError
 
@@ -50,6 +51,7 @@ def check_rules(calibration: Calibration) -> None:
             "coverage"
         )
     _check_thresholds(calibration.thresholds)
+    check_quantiles(calibration)
     _check_crossed(calibration)
     _check_model(calibration)
     _check_images(calibration)

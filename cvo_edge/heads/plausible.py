@@ -7,6 +7,7 @@ here needs the model, because ``calibration.json`` holds its outputs for the sel
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -19,7 +20,8 @@ from cvo_edge.bundle.format import (
     CalibrationSpec,
     Threshold,
 )
-from cvo_edge.conformal import least_draws, recording_cap
+from cvo_edge.bundle.quantiles import table_entries
+from cvo_edge.conformal import conformal_rank, least_draws, recording_cap
 from cvo_edge.documents import shown
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads import Head
@@ -66,19 +68,23 @@ class Draws(NamedTuple):
 
 def check_plausible(calibration: Calibration, head: Head) -> None:
     """Raise CalibrationFileError, naming the key, if the numbers contradict each other."""
+    entries = (*calibration.thresholds, *table_entries(calibration))
     _check_counts(calibration.calibration)
-    for entry in calibration.thresholds:
+    for entry in entries:
         _check_bounded(entry, calibration.calibration, head)
+    _check_ranks(entries, calibration.calibration, head)
     _check_joint(calibration, head)
     _check_growth(calibration, head)
     _check_scales(calibration)
-    _check_method(calibration, head)
+    _check_method(entries, calibration, head)
     _check_selftest(calibration)
-    _check_widths(calibration, head)
+    _check_widths(entries, calibration, head)
 
 
-def selftest_sets(calibration: Calibration, head: Head) -> list[ConformalSet]:
-    """Return the set of the self-test image for each stored threshold, from its stored outputs.
+def selftest_sets(
+    calibration: Calibration, head: Head, entries: Sequence[Threshold]
+) -> list[ConformalSet]:
+    """Return the set of the self-test image for each threshold, from its stored outputs.
 
     Widths are NaN if the method's solver finds no pose.
     """
@@ -100,7 +106,7 @@ def selftest_sets(calibration: Calibration, head: Head) -> list[ConformalSet]:
     estimate = found["pose"].astype(np.float64)
     estimate[:, 3:] /= np.linalg.norm(estimate[:, 3:], axis=1)
     point = chart.point(estimate[0])
-    return [head.conformal_set(found, point, entry) for entry in calibration.thresholds]
+    return [head.conformal_set(found, point, entry) for entry in entries]
 
 
 def _check_counts(source: CalibrationSpec) -> None:
@@ -133,6 +139,29 @@ def _check_bounded(entry: Threshold, source: CalibrationSpec, head: Head) -> Non
                 f"{where} numbers at {_named(entry)}, for which {needed} {draws.unit} suffice, "
                 f"found null with {given}"
             )
+
+
+def _check_ranks(entries: Sequence[Threshold], source: CalibrationSpec, head: Head) -> None:
+    """Check that levels with the same rank among the frames have the same threshold.
+
+    Recordings have no ranks: one of them counts each of its frames a little.
+    """
+    if recording_cap(source.rule, source.cap) is not None:
+        return
+    known: dict[tuple[str, str, int], Threshold] = {}
+    for entry in entries:
+        levels = head.levels(entry, source.joint)
+        for side, level in zip(("q_hat", "q_hat_upper"), levels, strict=False):
+            if level is None:
+                continue
+            rank = conformal_rank(source.n, level)
+            first = known.setdefault((entry.scope, side, rank), entry)
+            if getattr(first, side) != getattr(entry, side):
+                raise CalibrationFileError(
+                    f"quantiles.{entry.scope}: expected the thresholds of {first.confidence:.9g} "
+                    f"at {entry.confidence:.9g}, which has the same rank among {source.n} frames, "
+                    "found others"
+                )
 
 
 def _check_joint(calibration: Calibration, head: Head) -> None:
@@ -182,10 +211,10 @@ def _check_scales(calibration: Calibration) -> None:
             )
 
 
-def _check_method(calibration: Calibration, head: Head) -> None:
+def _check_method(entries: Sequence[Threshold], calibration: Calibration, head: Head) -> None:
     """Check thresholds and parameters against what the method can have."""
     least, most = head.score_range()
-    for entry in calibration.thresholds:
+    for entry in entries:
         for dof, value in enumerate(entry.q_hat):
             if value is not None and not least <= value <= most:
                 raise CalibrationFileError(
@@ -228,11 +257,11 @@ def _check_selftest(calibration: Calibration) -> None:
             )
 
 
-def _check_widths(calibration: Calibration, head: Head) -> None:
+def _check_widths(entries: Sequence[Threshold], calibration: Calibration, head: Head) -> None:
     """Check that the sets of the self-test image have a width, which grows with the level."""
     least = _LEAST_WIDTH * np.array(calibration.pose.standard_deviation)
     dof = Chart(calibration.pose.rotation).dof
-    found = list(zip(calibration.thresholds, selftest_sets(calibration, head), strict=True))
+    found = list(zip(entries, selftest_sets(calibration, head, entries), strict=True))
     found.sort(key=lambda each: each[0].confidence)
     for entry, each in found:
         if each.crossed:
@@ -242,9 +271,10 @@ def _check_widths(calibration: Calibration, head: Head) -> None:
                     "found bounds that cross"
                 )
             continue
-        # NaN widths are those of an image that no solver places; it gets no interval.
+        # NaN widths are those of an image that no solver places; it gets no interval. The least of
+        # many scores may be next to zero.
         narrow = each.width() < least
-        if narrow.any():
+        if narrow.any() and entry.confidence >= _MIDDLE:
             first = int(narrow.argmax())
             raise CalibrationFileError(
                 f"thresholds: expected a width of at least {least[first]:.3g} in {dof[first]} for "

@@ -189,7 +189,7 @@ def read_motion_file(path: Path) -> MotionFile:
 
 def decode_motion_file(content: bytes, where: str = "motion.json") -> MotionFile:
     """Parse and check the bytes of ``motion.json``; raises CalibrationFileError."""
-    return decode_document(content, MotionFile, SCHEMA_VERSION, where, _check)
+    return decode_document(content, MotionFile, (SCHEMA_VERSION,), where, _check)
 
 
 def encode_motion_file(file: MotionFile) -> bytes:

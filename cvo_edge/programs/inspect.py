@@ -17,6 +17,7 @@ from cvo_edge.bundle.format import (
     Position,
     SelfTest,
 )
+from cvo_edge.bundle.quantiles import reaches
 from cvo_edge.camera import Camera
 from cvo_edge.engine.model_cache import ModelCache
 from cvo_edge.errors import CalibrationFileError
@@ -62,6 +63,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         *_entry("alarm", alarm_statement(calibration)),
         *([] if scale is None else _entry("difficulty", _difficulty(scale))),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
+        *_entry("confidences", _confidences(calibration)),
         *_entry("self-test", _selftest(calibration.selftest)),
         *_entry("backbone", calibration.provenance.backbone or "a network supplied as ONNX"),
         "",
@@ -89,6 +91,15 @@ def _selftest(test: SelfTest) -> str:
         f"{test.width}x{test.height}, {count} numbers within {test.tolerance:g}; widths of its "
         "sets below, m and rad"
     )
+
+
+def _confidences(calibration: Calibration) -> str:
+    """Say which confidences a run can have, and from where on they are unbounded."""
+    table = calibration.quantiles
+    if table is None:
+        return "those below; the bundle holds no quantiles for others"
+    ends = ", ".join(f"{each.scope} {each.confidence:.4g}" for each in reaches(calibration))
+    return f"any, by {len(table.confidences)} quantiles; finite up to {ends}"
 
 
 def _difficulty(spec: DifficultySpec) -> str:
@@ -129,7 +140,7 @@ def _widths(calibration: Calibration, head: Head) -> list[str]:
     """Return the widths of the self-test image's sets, metres and radians, for each threshold."""
     dof = Chart(calibration.pose.rotation).dof
     lines = ["", f"{'width, self-test':<18}" + "".join(f"{name:>10}" for name in dof)]
-    sets = selftest_sets(calibration, head)
+    sets = selftest_sets(calibration, head, calibration.thresholds)
     for entry, found in zip(calibration.thresholds, sets, strict=True):
         width = found.width()
         if np.isfinite(width).any():

@@ -248,7 +248,11 @@ SourceArgument = Annotated[
     ),
 ]
 RunConfidenceOption = Annotated[
-    float, typer.Option(help="A confidence stored in the bundle.", rich_help_panel=INTERVALS)
+    float,
+    typer.Option(
+        help="One stored in the bundle, or any if it holds quantiles; see inspect.",
+        rich_help_panel=INTERVALS,
+    ),
 ]
 RunScopeOption = Annotated[
     Scope,

@@ -64,7 +64,7 @@ def replaced(document, path, value):
 
 
 REFUSED = [
-    (("schema_version",), 2, "schema_version: expected 1, found 2"),
+    (("schema_version",), 3, "schema_version: expected 1 or 2, found 3"),
     (("schema_version",), "1", "schema_version"),
     (("schema_version",), True, "schema_version"),
     (("name",), ..., "missing required field `name`"),

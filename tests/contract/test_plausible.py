@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from cvo_edge import CalibrationFileError
 from cvo_edge.bundle.format import CONFIDENCES
+from cvo_edge.bundle.quantiles import threshold_at
 from cvo_edge.bundle.reading import decode_calibration, encode_calibration, read_calibration
 from cvo_edge.conformal import capped_quantile, conformal_quantile
 from cvo_edge.heads.checked import checked_head
@@ -331,7 +332,7 @@ def test_inspect_shows_what_a_person_would_check(artifacts_dir):
     # difficulty of that image.
     calibration = honest(artifacts_dir, "cjp")
     test = calibration.selftest.outputs
-    factor = calibration.stored_threshold(0.9, "marginal").q_hat[0]
+    factor = threshold_at(calibration, 0.9, "marginal").q_hat[0]
     novelty = {"novelty": np.array([test["novelty"]])}
     factor *= Difficulty(calibration.difficulty).factors(novelty)[0]
     assert float(widths[4][0]) == pytest.approx(
@@ -379,7 +380,7 @@ def test_thresholds_fit_the_counts_that_made_them_and_no_others(
     for n in (1, 9, 11, 19, 40, 60, 119, 599, 600):
         scores = np.random.default_rng(n).uniform(0.5, 3.0, (n, number, 6))
         scored = exporter.Scored(scores, scores, np.arange(n))
-        entries = exporter.thresholds(head, scored, scored, rule, joint)
+        entries = exporter.Quantiles(head, scored, scored, rule, joint).entries()
         made[n] = entries, [(None in e.q_hat, None in (e.q_hat_upper or ())) for e in entries]
     for count, (_, there) in made.items():
         source = replace(

@@ -7,7 +7,7 @@ from cvo_edge.conformal import capped_quantile, conformal_quantile
 from cvo_edge.errors import UsageError
 from cvo_export.bundles.observed import Scored
 from cvo_export.bundles.rule import chosen_rule
-from cvo_export.bundles.thresholds import thresholds
+from cvo_export.bundles.thresholds import Quantiles
 
 CQR = {"half_width_floor": [0.01] * 6, "sides": "symmetric"}
 
@@ -66,7 +66,7 @@ def test_the_coverage_left_out_is_that_of_each_recording_by_the_others(
     head = make_head("cqr", "additive", CQR)
     found = {
         entry.scope: entry.left_out
-        for entry in thresholds(head, scored, scored, rule, "max", cap)
+        for entry in Quantiles(head, scored, scored, rule, "max", cap).entries()
         if entry.confidence == 0.9
     }
     scores, sequence = scored.marginal[:, 0], scored.sequence
@@ -87,7 +87,7 @@ def test_the_coverage_left_out_is_that_of_each_recording_by_the_others(
 def test_no_coverage_is_given_where_the_others_are_too_few(make_head, scored):
     head = make_head("cqr", "additive", CQR)
     # Finite from nine recordings at 0.9, so that eight have none to be measured with.
-    full = thresholds(head, scored, scored, "hierarchical", "max")
+    full = Quantiles(head, scored, scored, "hierarchical", "max").entries()
     assert {entry.confidence for entry in full if entry.left_out is not None} == {0.5, 0.8}
     one = scored._replace(sequence=np.zeros(120, np.int64))
-    assert all(e.left_out is None for e in thresholds(head, one, one, "pooled", "max"))
+    assert all(e.left_out is None for e in Quantiles(head, one, one, "pooled", "max").entries())

@@ -11,7 +11,7 @@ from cvo_edge.conformal import (
     conformal_rank,
 )
 from cvo_export.bundles.observed import Scored
-from cvo_export.bundles.thresholds import thresholds
+from cvo_export.bundles.thresholds import Quantiles
 
 REPEATS = 1000
 
@@ -165,7 +165,7 @@ def coverages(head, n, joint="max"):
     for repeat in range(REPEATS):
         start = repeat * (n + TRIALS)
         cal = Scored(*(values[start : start + n] for values in every))
-        entries = thresholds(head, cal, val, "pooled", joint)
+        entries = Quantiles(head, cal, val, "pooled", joint).entries()
         by_scope = {e.scope: e for e in entries if e.confidence == CONFIDENCE}
         for row in range(start + n, start + n + JUDGED):
             one = {name: values[row : row + 1] for name, values in outputs.items()}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import PoseSpec, Threshold
-from cvo_edge.conformal import conformal_quantile, interval_score
+from cvo_edge.conformal import conformal_quantiles, interval_score
 from cvo_edge.heads import Candidate, Head
 from cvo_edge.pose import Chart
 from cvo_export.bundles.difficulty import fitted_difficulty
@@ -83,7 +83,7 @@ def _judged(draft: Draft, head: Head, clean: Observed, noisy: Observed) -> Array
 def _threshold(head: Head, frames: Observed) -> Threshold:
     """Return the marginal threshold at 0.9 that these frames give."""
     scores = head.scores(frames.outputs, frames.point, frames.truth)
-    found = marginal_thresholds(head, scores, _LEVEL, conformal_quantile)
+    found = marginal_thresholds(head, scores, [_LEVEL], conformal_quantiles)[0]
     return entry_of(_LEVEL, "marginal", found)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,22 @@ Array = NDArray[np.float64]
 
 
 def marginal_thresholds(
-    head: Head, scores: Array, confidence: float, q_hat: Callable[[Array, float], float]
+    head: Head,
+    scores: Array,
+    confidences: Sequence[float],
+    q_hat: Callable[[Array, Sequence[float]], Array],
 ) -> Array:
-    """Return thresholds (sides, 6) from scores (n, sides, 6); infinite where unbounded."""
-    found = np.full(scores.shape[1:], np.inf)
-    for side, level in enumerate(head.side_confidences(confidence)):
-        if level is not None:
-            found[side] = [q_hat(scores[:, side, dof], level) for dof in range(6)]
+    """Return thresholds (m, sides, 6) at m confidences from scores (n, sides, 6).
+
+    They are infinite where unbounded; ``q_hat`` gives those of scores (n,) at m levels.
+    """
+    found = np.full((len(confidences), *scores.shape[1:]), np.inf)
+    sides = zip(*map(head.side_confidences, confidences), strict=True)
+    for side, levels in enumerate(sides):
+        given = [level for level in levels if level is not None]
+        if given:
+            for dof in range(6):
+                found[:, side, dof] = q_hat(scores[:, side, dof], given)
     return found
 
 

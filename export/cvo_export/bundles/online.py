@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Calibration
+from cvo_edge.bundle.quantiles import threshold_at
 from cvo_edge.engine.observation import Observation
 from cvo_edge.errors import UsageError
 from cvo_edge.monitor.adaptation import KEPT, Adaptation
@@ -106,7 +107,7 @@ def _played(
     schedule: Schedule | None,
 ) -> dict[str, Any]:
     head = odometer.head
-    start = calibration.stored_threshold(CONFIDENCE, scope)
+    start = threshold_at(calibration, CONFIDENCE, scope)
     adaptation = Adaptation(head, odometer.chart, calibration, start)
     coming: deque[tuple[int, Array]] = deque()
     missed: list[float] = []

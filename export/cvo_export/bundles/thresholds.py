@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import product
 
 import numpy as np
@@ -22,8 +23,9 @@ from cvo_edge.bundle.format import (
     Threshold,
 )
 from cvo_edge.conformal import (
-    capped_quantile,
-    conformal_quantile,
+    JointScale,
+    capped_quantiles,
+    conformal_quantiles,
     effective_sample_size,
     recording_cap,
 )
@@ -37,6 +39,7 @@ from cvo_export.bundles.difficulty import degraded
 from cvo_export.bundles.draft import SELFTEST_SIZE, Counts, Draft, images_of
 from cvo_export.bundles.entries import entry_of, marginal_thresholds
 from cvo_export.bundles.observed import Observed, Scored, in_order, observe
+from cvo_export.bundles.quantiles import with_quantiles
 from cvo_export.bundles.rule import left_out
 from cvo_export.datasets import PoseDataset
 
@@ -130,8 +133,9 @@ def completed(
         spec.name: tuple(float(f"{value:.9g}") for value in outputs[spec.name].reshape(-1).tolist())
         for spec in draft.model.outputs
     }
-    found = thresholds(head, cal, val, draft.rule, draft.joint, draft.cap)
-    return draft.calibrated(head, found, counts(cal), selftest, alarm)
+    found = Quantiles(head, cal, val, draft.rule, draft.joint, draft.cap)
+    calibration = draft.calibrated(head, found.entries(), counts(cal), selftest, alarm)
+    return with_quantiles(calibration, head, found.bounds)
 
 
 def with_thresholds(
@@ -142,12 +146,13 @@ def with_thresholds(
     Rule, joint scope and score stay; val scales the degrees of freedom for the joint scope.
     """
     source, scored = calibration.calibration, cal.scored(head)
+    rule = source.rule, source.joint, source.cap
     found = counts(scored)
     return replace(
         calibration,
-        thresholds=thresholds(
-            head, scored, val.scored(head), source.rule, source.joint, source.cap
-        ),
+        schema_version=1,
+        quantiles=None,
+        thresholds=Quantiles(head, scored, val.scored(head), *rule).entries(),
         calibration=replace(
             source,
             n=found.frames,
@@ -166,42 +171,75 @@ def counts(cal: Scored) -> Counts:
     )
 
 
-def thresholds(
-    head: Head, cal: Scored, val: Scored, rule: Rule, joint: Joint, cap: float | None = None
-) -> tuple[Threshold, ...]:
-    """Return the thresholds of both scopes at every confidence, from scores on cal.
+@dataclass(frozen=True)
+class Quantiles:
+    """The thresholds that a rule gives for scores on cal, with val's scores for the joint scope.
 
     ``pooled`` counts frames; ``capped``, with its ``cap``, and ``hierarchical`` count recordings
-    (see ``capped_quantile``); with too few of them a threshold is unbounded (null). The joint scope
-    ``max`` uses each frame's largest score, after scaling that makes the degrees of freedom
-    comparable on val; ``bonferroni`` uses six sets at a sixth of the miscoverage each. A method
-    with one score for all six gets the same threshold six times.
+    (see ``capped_quantile``); with too few of them a threshold is infinite. The joint scope ``max``
+    uses each frame's largest score, after scaling that makes the degrees of freedom comparable on
+    val; ``bonferroni`` uses six sets at a sixth of the miscoverage each. A method with one score
+    for all six gets the same threshold six times.
     """
-    counted, used, scale = recording_cap(rule, cap), _used_sides(head), head.joint_scale(val.joint)
-    largest = scale.comparable(cal.joint)[:, used].max(axis=(1, 2))
 
-    def found(confidence: float, scope: Scope, rows: NDArray[np.bool_]) -> Array:
-        """Thresholds (sides, 6) from the scores of these rows (n,)."""
+    head: Head
+    cal: Scored
+    val: Scored
+    rule: Rule
+    joint: Joint
+    cap: float | None = None
 
-        def q_hat(scores: Array, level: float) -> float:
+    @cached_property
+    def _scale(self) -> JointScale:
+        return self.head.joint_scale(self.val.joint)
+
+    @cached_property
+    def _largest(self) -> Array:
+        return np.asarray(self._scale.comparable(self.cal.joint)[:, self.used].max(axis=(1, 2)))
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Which sides are bounded."""
+        return np.array([level is not None for level in self.head.side_confidences(0.9)])
+
+    def compared(self, scope: Scope) -> Array:
+        """Return the scores (n, sides, 6) that the thresholds of a scope are compared with."""
+        return self.cal.joint if scope == "joint" and self.joint == "max" else self.cal.marginal
+
+    def bounds(
+        self, confidences: Sequence[float], scope: Scope, rows: NDArray[np.bool_] | None = None
+    ) -> Array:
+        """Thresholds (m, sides, 6) at m confidences, from the scores of these rows (n,) or all."""
+        rows = np.full(len(self._largest), True) if rows is None else rows
+        counted = recording_cap(self.rule, self.cap)
+
+        def q_hat(scores: Array, levels: Sequence[float]) -> Array:
             if counted is None:
-                return conformal_quantile(scores, level)
-            return capped_quantile(scores, cal.sequence[rows], level, counted)
+                return conformal_quantiles(scores, levels)
+            return capped_quantiles(scores, self.cal.sequence[rows], levels, counted)
 
-        if scope == "joint" and joint == "max":
-            together = np.full(cal.joint.shape[1:], np.inf)
-            together[used] = scale.thresholds(q_hat(largest[rows], confidence))[used]
+        if scope == "joint" and self.joint == "max":
+            together = np.full((len(confidences), *self.cal.joint.shape[1:]), np.inf)
+            found = q_hat(self._largest[rows], confidences).tolist()
+            together[:, self.used] = [self._scale.thresholds(q)[self.used] for q in found]
             return together
-        each = confidence if scope == "marginal" else 1.0 - (1.0 - confidence) / 6
-        return marginal_thresholds(head, cal.marginal[rows], each, q_hat)
+        if scope == "joint":
+            confidences = [1.0 - (1.0 - each) / 6 for each in confidences]
+        return marginal_thresholds(self.head, self.cal.marginal[rows], confidences, q_hat)
 
-    entries = []
-    for confidence, scope in product(CONFIDENCES, SCOPES):
-        at = partial(found, confidence, scope)
-        compared = cal.joint if scope == "joint" and joint == "max" else cal.marginal
-        left = left_out(compared, cal.sequence, used, scope, at)
-        entries.append(entry_of(confidence, scope, at(np.full(len(largest), True)), left))
-    return tuple(entries)
+    def entries(self) -> tuple[Threshold, ...]:
+        """Return the thresholds of both scopes at every confidence that is stored."""
+        entries = []
+        for confidence, scope in product(CONFIDENCES, SCOPES):
+
+            def at(
+                rows: NDArray[np.bool_] | None = None, level: float = confidence, of: Scope = scope
+            ) -> Array:
+                return np.asarray(self.bounds([level], of, rows)[0])
+
+            left = left_out(self.compared(scope), self.cal.sequence, self.used, scope, at)
+            entries.append(entry_of(confidence, scope, at(), left))
+        return tuple(entries)
 
 
 def effective_frames(scored: Scored) -> float:
@@ -219,7 +257,3 @@ def effective_frames(scored: Scored) -> float:
         sum(effective_sample_size(column[sequence == number]) for number in np.unique(sequence))
         for column in columns
     )
-
-
-def _used_sides(head: Head) -> NDArray[np.bool_]:
-    return np.array([level is not None for level in head.side_confidences(0.9)])
