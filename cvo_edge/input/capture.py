@@ -100,6 +100,31 @@ class Reader(Protocol):
         """Release the device; see ``Capture.close``."""
 
 
+class Device(Protocol):
+    """What of ``cv2.VideoCapture`` is used."""
+
+    def open(self, _: Any, /, api: int = 0, limits: Any = ()) -> bool:  # noqa: ANN401 - overloads
+        """Open a device or file."""
+
+    def grab(self) -> bool:
+        """Go on to the next frame."""
+
+    def retrieve(self) -> tuple[bool, Any]:
+        """Return the frame that was grabbed."""
+
+    def get(self, _: int, /) -> float:
+        """Return a property."""
+
+    def set(self, _: int, value: float, /) -> bool:
+        """Set a property."""
+
+    def getBackendName(self) -> str:  # noqa: N802 - OpenCV's name
+        """Return the name of what reads."""
+
+    def release(self) -> None:
+        """Release the device."""
+
+
 class Capture:
     """A video file, camera or stream that OpenCV reads, in one thread.
 
@@ -114,6 +139,7 @@ class Capture:
         timeout_s: float,
         clock: Clock = SYSTEM_CLOCK,
         threads: int | None = None,
+        video: Callable[[], Device] | None = None,
     ) -> None:
         hanging = sum(thread.is_alive() for thread in _hanging)
         if hanging >= _MOST_HANGING:
@@ -124,7 +150,8 @@ class Capture:
         self._idle = Event()
         self._closed = False
         # The thread holds no reference to this object, so that dropping it ends the thread.
-        arguments = (self._calls, self._answers, self._idle, clock, threads)
+        make = video or cv2.VideoCapture
+        arguments = (self._calls, self._answers, self._idle, clock, threads, make)
         thread = Thread(target=_work, args=arguments, name=READER, daemon=True)
         try:
             thread.start()
@@ -205,8 +232,9 @@ def _work(
     idle: Event,
     clock: Clock,
     threads: int | None,
+    video: Callable[[], Device],
 ) -> None:
-    opened = _Opened(cv2.VideoCapture(), clock, threads)
+    opened = _Opened(video(), clock, threads)
     while (call := calls.get()) is not None:
         try:
             answer = call(opened)
@@ -237,7 +265,7 @@ class _Stated(NamedTuple):
 class _Opened:
     """The capture and the ages of its frames; only the reading thread uses it."""
 
-    def __init__(self, capture: cv2.VideoCapture, clock: Clock, threads: int | None) -> None:
+    def __init__(self, capture: Device, clock: Clock, threads: int | None) -> None:
         self._capture, self._clock, self._threads = capture, clock, threads
         self._account = LagAccount(clock.now_s(), 0.0)
         self._driver: DriverStamps | None = None
@@ -247,7 +275,9 @@ class _Opened:
         """Open the device; return what it states of itself, None if it does not open."""
         begin = self._clock.now_s()
         try:
-            with _written_to(device, wait_s):
+            # Another one's bytes have begun.
+            own = isinstance(self._capture, cv2.VideoCapture)
+            with _written_to(device, wait_s) if own else contextlib.nullcontext():
                 if not self._open(device):
                     return None
             # As for image files: pixels in the sensor's order, whatever the container asks for.

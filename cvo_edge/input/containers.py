@@ -43,9 +43,14 @@ def check_video(path: Path) -> None:
             start = stream.read(_START_BYTES)
     except OSError as error:
         raise SourceError(f"{shown(str(path))}: cannot be read: {error.strerror}") from None
+    check_start(shown(str(path)), start)
+
+
+def check_start(name: str, start: bytes) -> None:
+    """Raise SourceError unless these first bytes are those of a video of a camera."""
     if not is_video(start):
         raise SourceError(
-            f"{shown(str(path))}: expected images or a video (MP4, MOV, MKV, WebM, AVI, MPEG, FLV, "
+            f"{name}: expected images or a video (MP4, MOV, MKV, WebM, AVI, MPEG, FLV, "
             f"WMV, Ogg, MXF, DV, IVF, Y4M, H.264, H.265, MJPEG), found {_kind(start)}"
         )
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import glob
-import math
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from operator import index
@@ -18,7 +16,6 @@ from typing import SupportsIndex, TypeVar
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.input.capture import OPENING, TIMEOUT_S, Capture, Reader, shown
 from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
-from cvo_edge.input.containers import check_video
 from cvo_edge.input.frame import Frame, Source
 from cvo_edge.input.image_files import (
     IMAGE_SUFFIXES,
@@ -29,11 +26,11 @@ from cvo_edge.input.image_files import (
     is_one_image,
     stamp_at,
 )
+from cvo_edge.input.pipes import names_fifo, names_pipe, piped_source, without_stdin
 from cvo_edge.input.stamps import NAMES, ListedStamps
+from cvo_edge.input.videos import HIGHEST_FPS, LOWEST_FPS, Video, itself
 from cvo_edge.input.waiting import LONGEST_PAUSE_S, FewAttempts, Patience
 
-# Stamps are nanoseconds in 64 bits, which must last for years.
-LOWEST_FPS, HIGHEST_FPS = 1e-3, 1e6
 LONGEST_S = 3600.0
 
 # Pauses before each new attempt to open a camera: eight seconds in total.
@@ -49,16 +46,18 @@ def open_source(
     stamps: str | None = None,
     patience: Patience | None = None,
     threads: int | None = None,
+    *,
+    live: bool = False,
 ) -> Source:
-    """Open a folder of images, a glob, a video file, a camera or a stream.
+    """Open a folder of images, a glob, a video file, a pipe, a camera or a stream.
 
     Parameters
     ----------
     source
         Folder of images (natural order, without hidden files; which ones by the marks in their
-        names, see ``colour_images``), a glob pattern, a video file, a camera index such as ``0``,
-        a device path such as ``/dev/video0``, a named pipe, or the address of a stream such as
-        ``rtsp://...``.
+        names, see ``colour_images``), a glob pattern, a video file, ``-`` for standard input, a
+        named pipe, a camera index such as ``0``, a device path such as ``/dev/video0``, or the
+        address of a stream such as ``rtsp://...``.
     fps
         Frames per second to stamp frames with, starting at zero, instead of the source's own.
     timeout_s
@@ -70,6 +69,9 @@ def open_source(
         How long a camera is waited for, see ``Camera``.
     threads
         Most threads of a video's decoder; by default one per core.
+    live
+        Whether a pipe is a camera's: its frames are then stamped as they arrive and grow old, and
+        a named pipe is opened again for its next writer. Else it is a recording.
 
     Raises
     ------
@@ -79,7 +81,9 @@ def open_source(
         ``source`` is of another type, ``fps`` or ``timeout_s`` is out of range, or ``stamps`` is
         given with ``fps``, for a camera, or as ``names`` for a video.
     """
-    text = _text(source)
+    text = without_stdin(_text(source))
+    # What is waited for is a camera.
+    live = live or patience is not None
     if fps is not None and not LOWEST_FPS <= fps <= HIGHEST_FPS:
         raise UsageError(f"fps: expected {LOWEST_FPS:g} to {HIGHEST_FPS:g}, found {fps:g}")
     if not 0.0 < timeout_s <= LONGEST_S:
@@ -97,7 +101,9 @@ def open_source(
         )
     if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
         raise SourceError(f"{shown(text)}: expected a file's path, found a file address")
-    if names_camera(text):
+    if names_pipe(text) and not (live and names_fifo(text)):
+        return piped_source(text, fps, timeout_s, _listed(stamps), threads, live=live)
+    if names_camera(text) or names_pipe(text):
         if stamps is not None:
             raise UsageError(
                 f"stamps: expected images or a video, whose stamps they are, found {shown(text)}, "
@@ -109,13 +115,7 @@ def open_source(
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES or is_one_image(path):
             return ImageFiles(Listing("", [text], {}), fps, "", stamps)
-        if stamps == NAMES:
-            raise UsageError(
-                f"stamps: expected a list of times for a video, found {NAMES}, which are those of "
-                "image files"
-            )
-        listed = None if stamps is None else ListedStamps(Path(stamps))
-        return Video(path, fps, timeout_s, listed, threads)
+        return Video(path, fps, timeout_s, _listed(stamps), threads)
     if glob.has_magic(text):
         found = [name for name in glob.iglob(text, recursive=True) if not os.path.isdir(name)]  # noqa: PTH112
         return ImageFiles(
@@ -137,118 +137,24 @@ def _text(source: str | os.PathLike[str] | int) -> str:
     return text
 
 
+def _listed(stamps: str | None) -> ListedStamps | None:
+    if stamps == NAMES:
+        raise UsageError(
+            f"stamps: expected a list of times for a video, found {NAMES}, which are those of "
+            "image files"
+        )
+    return None if stamps is None else ListedStamps(Path(stamps))
+
+
 def names_camera(text: str) -> bool:
-    """Whether ``text`` names a live source: an index, a device, a named pipe or an address."""
+    """Whether ``text`` names a live source: an index, a device or an address."""
     path = Path(text)
-    if path.is_dir():
+    if path.is_dir() or names_pipe(text):
         return False
-    if text.isdecimal() or path.is_char_device() or path.is_fifo() or "://" in text:
+    if text.isdecimal() or path.is_char_device() or "://" in text:
         return True
     # A camera that is not plugged in has no device.
     return path.parts[:2] == ("/", "dev") and path.parts[2:3] != ("shm",) and not path.exists()
-
-
-class Video:
-    """A video file. Stamps are its container's, from the first frame on, unless others are given.
-
-    A frame that does not decode has no image if a later one decodes; else the video ends there.
-    """
-
-    live = False
-
-    # So many in a row are the end, also if the container announces no number of frames.
-    _UNREADABLE_IN_A_ROW = 100
-
-    def __init__(
-        self,
-        path: Path,
-        fps: float | None,
-        timeout_s: float = TIMEOUT_S,
-        stamps: ListedStamps | None = None,
-        threads: int | None = None,
-    ) -> None:
-        check_video(path)
-        self._path = path
-        self._capture = Capture(str(path), timeout_s, threads=threads)
-        own_fps, announced = self._capture.open()
-        self.length: int | None = announced if announced > 0 else None
-        self._listed = stamps
-        if stamps is not None:
-            stamps.check(self.length)
-        self._stamps = stamps or _VideoStamps(fps, own_fps)
-
-    def reads(self) -> Iterator[Callable[[], Frame]]:
-        """Yield the frames; each is read before its call is yielded."""
-        for frame in self:
-            yield partial(_itself, frame)
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames.
-
-        Raises SourceError if the file ends before its own count, or does not fit listed stamps.
-        """
-        seq = unreadable = 0
-        with closing(self._capture):
-            while unreadable < self._UNREADABLE_IN_A_ROW:
-                if (grabbed := self._capture.read()) is None:
-                    unreadable += 1
-                    continue
-                found = [*[(None, 0.0)] * unreadable, (grabbed.image, grabbed.read_ms)]
-                fresh = grabbed.fresh_noise
-                stamps = self._stamps.next(len(found), grabbed.position_ms)
-                for (image, read_ms), stamp_ns in zip(found, stamps, strict=True):
-                    name = f"{shown(self._path.name)}#{seq}"
-                    yield Frame(image, stamp_ns, name, read_ms, fresh_noise=fresh)
-                    seq += 1
-                unreadable = 0
-        if self.length is not None and seq < self.length:
-            raise SourceError(
-                f"{self._path}: ended early: {seq} of {self.length} frames (by its header or "
-                "duration); copy or record it again"
-            )
-        if self._listed is not None:
-            self._listed.end()
-
-
-class _VideoStamps:
-    """Times of a container's frames in ns, from the first one, unless a rate is given.
-
-    A frame that a decoder skips does not shift later ones, and a phone's frame rate varies. For a
-    container without times, they follow from its rate.
-    """
-
-    # A record's nanoseconds have 64 bits.
-    _END_NS = 2.0**62
-
-    def __init__(self, fps: float | None, own_fps: float) -> None:
-        self._fps = fps
-        believable = LOWEST_FPS <= own_fps <= HIGHEST_FPS
-        self._gap_ns = 1e9 / own_fps if believable else None
-        self._seq, self._has_times = 0, False
-        self._origin_ms, self._last_ns = math.nan, 0.0
-
-    def next(self, count: int, position_ms: float) -> list[int | None]:
-        """Return the stamps of the next ``count`` frames, the last of which is at ``position_ms``.
-
-        The unreadable frames before it are spaced evenly.
-        """
-        begin, self._seq = self._seq, self._seq + count
-        if self._fps is not None:
-            return [stamp_at(seq, self._fps) for seq in range(begin, self._seq)]
-        if self._gap_ns is None:
-            return [None] * count
-        last_ns = self._last_ns
-        if begin == 0:
-            last_ns = -self._gap_ns
-            self._origin_ms = position_ms - 1e-6 * self._gap_ns * (count - 1)
-        now_ns = 1e6 * (position_ms - self._origin_ms)
-        if last_ns < now_ns < self._END_NS:
-            self._has_times = begin > 0
-        else:
-            # Half a frame if others have times, so that the next one's is later again.
-            now_ns = last_ns + self._gap_ns * (0.5 if self._has_times else count)
-        self._last_ns = now_ns
-        return [round(last_ns + (now_ns - last_ns) * (k + 1) / count) for k in range(count)]
 
 
 class Camera:
@@ -303,7 +209,7 @@ class Camera:
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield the frames; each is read before its call is yielded."""
         for frame in self:
-            yield partial(_itself, frame)
+            yield partial(itself, frame)
 
     @property
     def longest_silence_s(self) -> float:
@@ -392,7 +298,3 @@ class Camera:
                 break
             self._clock.wait(self._stopped, self._patience.failed(problem))
         return None
-
-
-def _itself(frame: Frame) -> Frame:
-    return frame

@@ -23,6 +23,7 @@ from cvo_edge.estimate import PoseInterval
 from cvo_edge.input import preprocess
 from cvo_edge.input.capture import shown
 from cvo_edge.input.frame import Frame
+from cvo_edge.input.pipes import names_pipe
 from cvo_edge.input.sources import names_camera, open_source
 from cvo_edge.odometer import Odometer
 from cvo_edge.programs.measure import (
@@ -320,6 +321,11 @@ class _Endless:
             if first is None:
                 raise SourceError(f"{shown(self._source)}: the source has no frames")
             yield from chain([first], reads)
+            if names_pipe(self._source):
+                raise SourceError(
+                    f"{shown(self._source)}: expected as many frames as are timed, found the end "
+                    "of the pipe; use a file, which is read again, or fewer --frames"
+                )
 
 
 def _still_size(calibration: Calibration) -> tuple[int, int]:

@@ -99,7 +99,13 @@ def opened(
     are added to the metrics.
     """
     frames = open_source(
-        wanted.source, wanted.fps, wanted.timeout, wanted.stamps, patience, wanted.threads
+        wanted.source,
+        wanted.fps,
+        wanted.timeout,
+        wanted.stamps,
+        patience,
+        wanted.threads,
+        live=wanted.mode == "live",
     )
     with (
         Odometer.load(

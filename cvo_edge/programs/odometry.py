@@ -47,7 +47,8 @@ def odometry(
     source: Annotated[
         str,
         typer.Argument(
-            help="Folder of images, glob, video file, camera index or device, or stream address.",
+            help="Folder of images, glob, video file, - or a pipe, camera index or device, or "
+            "stream address.",
             show_default=False,
         ),
     ],

@@ -243,7 +243,8 @@ MetricsOption = Annotated[
 SourceArgument = Annotated[
     str,
     typer.Argument(
-        help="Folder of images, glob, video file, camera index or device, or stream address.",
+        help="Folder of images, glob, video file, - or a pipe, camera index or device, or stream "
+        "address.",
         show_default=False,
     ),
 ]

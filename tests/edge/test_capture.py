@@ -309,7 +309,7 @@ def test_a_camera_that_never_answers_is_given_up(bundle_dir, tmp_path):
     """Runs in its own process: OpenCV opens one stream at a time, and this one never opens."""
     pipe = tmp_path / "camera"
     os.mkfifo(pipe)
-    arguments = ["run", bundle_dir, pipe, "--timeout", "0.1"]
+    arguments = ["run", bundle_dir, pipe, "--timeout", "0.1", "--mode", "live"]
     done = subprocess.run(
         [sys.executable, "-c", RUN, *map(str, arguments)],
         capture_output=True,

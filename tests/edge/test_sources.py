@@ -20,7 +20,8 @@ from cvo_edge.input.capture import READER, Capture
 from cvo_edge.input.containers import is_video
 from cvo_edge.input.decoding import decode_image
 from cvo_edge.input.image_files import colour_images, left_out_text
-from cvo_edge.input.sources import Video, _VideoStamps, open_source
+from cvo_edge.input.sources import open_source
+from cvo_edge.input.videos import Video, VideoStamps
 
 
 def picture(value=0, height=48, width=64):
@@ -293,7 +294,7 @@ def test_a_video_without_an_end_in_sight_ends(video):
 def test_stamps_are_the_container_s_times():
     """Includes frames of unequal length, and an OpenCV that reports the frame's end."""
     for shift_ms in (0.0, 40.0):
-        stamps = _VideoStamps(None, 25.0)
+        stamps = VideoStamps(None, 25.0)
         found = [stamps.next(1, shift_ms + place) for place in (0.0, 40.0, 90.0, 120.0)]
         assert found == [[0], [40_000_000], [90_000_000], [120_000_000]]
         # Two unreadable frames are interpolated.
@@ -302,7 +303,7 @@ def test_stamps_are_the_container_s_times():
 
 def test_a_missing_position_shifts_only_its_own_stamp():
     places = [0.0, 16.7, 33.3, 0.0, 66.7, 83.3, float("nan"), 133.3]
-    stamps = _VideoStamps(None, 30.0)
+    stamps = VideoStamps(None, 30.0)
     found = [1e-6 * stamps.next(1, place)[0] for place in places]
     assert found == sorted(set(found))
     assert [found[k] for k in (0, 1, 2, 4, 5, 7)] == pytest.approx(
@@ -312,18 +313,18 @@ def test_a_missing_position_shifts_only_its_own_stamp():
 
 @pytest.mark.parametrize("place", [0.0, -1.0, float("nan"), float("inf"), 1e300])
 def test_a_container_without_times_has_those_of_its_frame_rate(place):
-    stamps = _VideoStamps(None, 25.0)
+    stamps = VideoStamps(None, 25.0)
     assert [stamps.next(1, place) for _ in range(3)] == [[0], [40_000_000], [80_000_000]]
     assert stamps.next(2, place) == [120_000_000, 160_000_000]
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, 2.3e-10, 1e9, float("nan"), float("inf")])
 def test_an_impossible_rate_gives_no_stamps(rate):
-    assert _VideoStamps(None, rate).next(2, 40.0) == [None, None]
+    assert VideoStamps(None, rate).next(2, 40.0) == [None, None]
 
 
 def test_a_given_rate_is_taken_whatever_the_container_says():
-    stamps = _VideoStamps(10.0, 25.0)
+    stamps = VideoStamps(10.0, 25.0)
     assert [stamps.next(1, 40.0 * seq) for seq in range(3)] == [[0], [100_000_000], [200_000_000]]
 
 

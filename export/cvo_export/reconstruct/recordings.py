@@ -14,6 +14,7 @@ from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.files import write_whole
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.image_files import images_in
+from cvo_edge.input.pipes import names_pipe
 from cvo_edge.input.sources import names_camera, open_source
 from cvo_export.files import write_json
 from cvo_export.progress import Progress
@@ -59,8 +60,11 @@ def find_recordings(paths: Sequence[str]) -> list[Recording]:
     found: list[Recording] = []
     for text in paths:
         path = Path(text)
-        if names_camera(text):
-            raise UsageError(f"{text}: expected a video file or a folder of images, found a camera")
+        if names_camera(text) or names_pipe(text):
+            found_kind = "a camera" if names_camera(text) else "a pipe"
+            raise UsageError(
+                f"{text}: expected a video file or a folder of images, found {found_kind}"
+            )
         if not path.exists():
             raise SourceError(f"{text}: expected a video file or a folder of images, found neither")
         stem = path.resolve().name if path.is_dir() else path.stem
