@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cvo_edge.errors import UsageError
 from cvo_edge.files import read_regular_file
+from cvo_edge.given import given_path
 
 Array = NDArray[np.float64]
 
@@ -178,13 +179,13 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit
         return found, jacobian.reshape(*rays.shape, 2)
 
 
-def read_camera(given: str | Path) -> Camera:
+def read_camera(given: str | os.PathLike[str]) -> Camera:
     """Read a camera from a JSON file with the fields of ``Camera``, or from a short text.
 
     The text is ``WIDTHxHEIGHT,FX,FY,CX,CY``. A file ``*.yaml`` is a ``sensor.yaml`` of the ASL
     layout, as EuRoC has it. Raises UsageError.
     """
-    path = Path(given)
+    path = given_path(given, "camera")
     short = _SHORT.fullmatch(str(given))
     if short is not None and not path.exists():
         try:
@@ -193,7 +194,7 @@ def read_camera(given: str | Path) -> Camera:
             raise UsageError(
                 f"camera: expected WIDTHxHEIGHT,FX,FY,CX,CY in pixels, found {given}: {error}"
             ) from None
-    if not os.path.lexists(path) or not str(given):
+    if not os.path.lexists(path) or given == "":
         raise UsageError(
             f"camera: expected WIDTHxHEIGHT,FX,FY,CX,CY or a JSON file, found {given}: no such file"
         )

@@ -44,10 +44,11 @@ def decode_document(
         document = _parse_json(content)
         found = document.get("schema_version")
         if type(found) is not int or found not in versions:
+            newer = type(found) is int and found > max(versions)
+            remedy = "a newer file needs a newer cvo-edge" if newer else "make the file again"
             raise CalibrationFileError(
                 f"schema_version: expected {' or '.join(map(str, versions))}, found "
-                f"{shown(found)}; "
-                "a newer file needs a newer cvo-edge"
+                f"{shown(found)}; {remedy}"
             )
         _check_digest(content)
         decoded = msgspec.convert(document, kind, strict=True)

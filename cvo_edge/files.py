@@ -55,7 +55,9 @@ def regular_file(
         raise error(f"{path}: no such file") from None
     except OSError as failure:
         if failure.errno == errno.ELOOP:
-            raise error(f"{path}: expected a regular file, found a symbolic link") from None
+            raise error(
+                f"{path}: expected a regular file, found a symbolic link; copy with cp -L"
+            ) from None
         raise error(f"{path}: cannot be opened as a regular file: {failure.strerror}") from None
     found = os.fstat(descriptor)
     if stat.S_ISREG(found.st_mode) and found.st_size <= limit:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
-from operator import index
-from pathlib import Path
+from functools import partial
 from threading import Lock
 from time import perf_counter
 from types import TracebackType
@@ -26,6 +25,7 @@ from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError, ModelError, UsageError
 from cvo_edge.estimate import Drift, PoseInterval
+from cvo_edge.given import given_path
 from cvo_edge.input.clock import SYSTEM_CLOCK
 from cvo_edge.input.frame import Frame, checked_hint
 from cvo_edge.monitor.adaptation import Adaptation
@@ -120,6 +120,7 @@ class Odometer(Labelled):
         self._clock = SYSTEM_CLOCK
         self._stepping = Lock()
         self._seq = 0
+        self._loaded: Callable[[], Odometer] | None = None
 
     @classmethod
     def load(
@@ -146,34 +147,27 @@ class Odometer(Labelled):
         same folder, unless ``name`` names them. Raises the errors of ``read_bundle``, too.
         """
         check = trust = None
+        sealed = cache
         if public_key is not None:
             from cvo_edge.bundle.signature import Trust
 
-            trust = Trust.in_key(Path(public_key), name)
+            trust = Trust.in_key(given_path(public_key, "public_key"), name)
             check = trust.check
-            cache = None if cache is None else cache.sealed(trust.record, trust.key_sha256)
+            sealed = None if cache is None else cache.sealed(trust.record, trust.key_sha256)
         elif name is not None:
             raise UsageError(f"name: expected a public key with it, found none with {name}")
 
-        def opened(cache: ModelCache | None) -> Odometer:
-            return cls(
-                read_bundle(bundle, cache=cache, check=check),
-                threads=threads,
-                mode=mode,
-                confidence=confidence,
-                scope=scope,
-                camera=camera,
-                adapt=adapt,
-                state=state,
-            )
-
+        settings: dict[str, Any] = {"threads": threads, "mode": mode, "confidence": confidence}
+        settings |= {"scope": scope, "camera": camera, "adapt": adapt, "state": state}
         try:
-            odometer = opened(cache)
+            odometer = cls(read_bundle(bundle, cache=sealed, check=check), **settings)
         except ModelError:
-            if cache is None:
+            if sealed is None:
                 raise
             # Another process may have cleared the cache after it was read.
-            odometer = opened(None)
+            odometer = cls(read_bundle(bundle, cache=None, check=check), **settings)
+        settings |= {"cache": cache, "public_key": public_key, "name": name}
+        odometer._loaded = partial(cls.load, bundle, **settings)
         if trust is not None and trust.is_new:
             try:
                 check_selftest(odometer)
@@ -182,6 +176,12 @@ class Odometer(Labelled):
                 raise
             trust.remember()
         return odometer
+
+    def __reduce__(self) -> tuple[Callable[[], Odometer], tuple[()]]:
+        """Copy or pickle by folder and settings: the copy loads the bundle and starts a stream."""
+        if self._loaded is None:
+            raise UsageError("copy: expected an odometer of Odometer.load, found one of a Bundle")
+        return self._loaded, ()
 
     def __repr__(self) -> str:
         calibration = self.calibration
@@ -255,10 +255,6 @@ class Odometer(Labelled):
         ModelError
             Inference failed.
         """
-        try:
-            stamp_ns = None if stamp_ns is None else index(stamp_ns)
-        except TypeError:
-            raise UsageError(f"stamp_ns: expected an int or None, found {stamp_ns!r}") from None
         moving = checked_hint(moving)
         frame = Frame(image_bgr, stamp_ns, source, read_ms, fresh_noise=fresh_noise, moving=moving)
         # Stream checks compare consecutive frames, so threads must not interleave.

@@ -45,6 +45,7 @@ class Reason(StrEnum):
     PICTURE_STILL = "picture_still"  # degraded: the camera moves, as stated, but not its picture
     FRAME_STALE = "frame_stale"  # degraded: the frame waited for more than a second
     STAMP_NOT_LATER = "stamp_not_later"  # degraded: not later than the previous frame's stamp
+    STAMP_IMPLAUSIBLE = "stamp_implausible"  # degraded: a stamp before 1970 or after 2262
     BOUNDS_CROSSED = (
         "bounds_crossed"  # ok: a negative correction emptied a set; it is now its midpoint
     )

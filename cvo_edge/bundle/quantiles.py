@@ -23,6 +23,7 @@ from cvo_edge.bundle.format import (
 )
 from cvo_edge.documents import shown
 from cvo_edge.errors import CalibrationFileError, UsageError
+from cvo_edge.given import given_number
 from cvo_edge.vocabulary import SCOPES, Scope
 
 # The range of ``Threshold.confidence``.
@@ -46,10 +47,7 @@ def threshold_at(calibration: Calibration, confidence: float, scope: Scope) -> T
         raise UsageError(
             f"scope: expected one of {', '.join(get_args(Scope))}, found {shown(scope)}"
         )
-    try:
-        wanted = float(confidence)
-    except (TypeError, ValueError):
-        raise UsageError(f"confidence: expected a number, found {shown(confidence)}") from None
+    wanted = given_number(confidence, "confidence")
     found = calibration.threshold(wanted, scope)
     if found is not None:
         return found

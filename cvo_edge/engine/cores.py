@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from cvo_edge.errors import UsageError
+from cvo_edge.given import given_count
 
 MAX_THREADS = 64
 
@@ -66,9 +67,12 @@ def _group_cores(folder: Path) -> float:
 def checked_threads(threads: int | None) -> int:
     """Return the number of threads, by default one per allowed core; raises UsageError."""
     # The engine accepts a thousand threads, and then takes minutes per frame.
-    if threads is not None and not (isinstance(threads, int) and 1 <= threads <= MAX_THREADS):
+    if threads is None:
+        return allowed_cores()
+    count = given_count(threads, "threads")
+    if not 1 <= count <= MAX_THREADS:
         raise UsageError(f"threads: expected 1 to {MAX_THREADS}, found {threads!r}")
-    return threads or allowed_cores()
+    return count
 
 
 def cores_of_threads(threads: int, taken: Iterable[int] = ()) -> list[int]:

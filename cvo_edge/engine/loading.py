@@ -13,6 +13,7 @@ from cvo_edge.bundle.reading import Check, check_model_file, read_calibration_fi
 from cvo_edge.engine.model_cache import CachedModel, ModelCache, identity
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
+from cvo_edge.given import given_path
 from cvo_edge.heads import Head
 from cvo_edge.heads.checked import checked_head
 from cvo_edge.input import preprocess
@@ -85,7 +86,7 @@ def read_bundle(
         ``model.onnx`` is not the calibrated model, even if the cache holds that one, or its tensors
         do not match the method. ``check`` may raise other errors.
     """
-    path = Path(folder)
+    path = given_path(folder, "bundle")
     calibration, content = read_calibration_file(path)
     head = checked_head(calibration)
     if check is not None:

@@ -32,6 +32,7 @@ from msgspec import Struct
 from cvo_edge.bundle.device_record import DeviceRecord
 from cvo_edge.errors import BundleMismatchError, SinkError
 from cvo_edge.files import own_folder, untrusted, write_whole
+from cvo_edge.given import given_path
 
 GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
 SEEN_FILE = "seen.json"
@@ -105,7 +106,7 @@ class ModelCache:
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = Path(folder)
+        self.folder = given_path(folder, "cache")
         self._seal: tuple[DeviceRecord, str] | None = None
 
     @classmethod

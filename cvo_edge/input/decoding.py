@@ -27,6 +27,8 @@ _JPEG_END, _JPEG_SCAN = b"\xff\xd9", b"\xff\xda"
 _MOST_PARTS = 4096
 # Each scan takes as long to decode as a picture; cameras write one, tools about ten.
 _MOST_SCANS = 64
+# Within the data, 0xFF is followed by a zero or a restart marker.
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 # Frame types that are not progressive: one scan of all components is the whole picture (T.81, B.1).
 _SEQUENTIAL = frozenset((0xC0, 0xC1, 0xC9))
 # Markers without a length belong in the data; decoders disagree on what follows one elsewhere.
@@ -110,12 +112,30 @@ def _jpeg(content: bytes) -> tuple[int, int] | None:
                 components = 0
         if marker == 0xDA:
             alone = 0 < components == content[position + 4]
-            # Neither marker can occur within the data.
+            # The marker cannot occur within the data.
             whole = content.rfind(_JPEG_END) >= position + 2 + length
-            few = alone or content.count(_JPEG_SCAN) <= _MOST_SCANS
+            few = alone or _few_scans(content, position)
             return size if whole and few else None
         position += 2 + length
     return None
+
+
+def _few_scans(content: bytes, position: int) -> bool:
+    """Whether a JPEG ends after few scans, from the first one's marker; other bytes may follow."""
+    scans = 0
+    for _ in range(_MOST_PARTS):
+        kind = content[position + 1]
+        if kind == _JPEG_END[1]:
+            return True
+        scans += kind == _JPEG_SCAN[1]
+        if scans > _MOST_SCANS:
+            return False
+        (length,) = struct.unpack_from(">H", content, position + 2)
+        found = _JPEG_MARKER.search(content, position + 2 + length)
+        if found is None:
+            return False
+        position = found.start()
+    return False
 
 
 def _png(content: bytes) -> tuple[int, int] | None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.errors import UsageError
+from cvo_edge.given import given_count, given_number
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,15 @@ class Frame:
     skipped: int = 0
     fresh_noise: bool = True
     moving: bool | None = None
+
+    def __post_init__(self) -> None:
+        """Take numbers of numpy and paths; raise UsageError for a stamp or time that is none."""
+        if self.stamp_ns is not None and type(self.stamp_ns) is not int:
+            object.__setattr__(self, "stamp_ns", given_count(self.stamp_ns, "stamp_ns"))
+        if type(self.source) is not str:
+            object.__setattr__(self, "source", str(self.source))
+        if type(self.read_ms) is not float:
+            object.__setattr__(self, "read_ms", given_number(self.read_ms, "read_ms"))
 
     def age_ms(self, now_s: float) -> float:
         """Return an upper bound on the frame's age at ``now_s`` of ``Clock.now_s``."""

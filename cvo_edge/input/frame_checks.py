@@ -27,6 +27,8 @@ _BLACK, _SATURATED, _FLAT = 20, 250, 4.0
 _FEW = 0.02
 # An older frame says where the camera was, not where it is.
 _STALE_MS = 1000.0
+# 64 bits hold nanoseconds from 1970 up to the year 2262.
+_END_NS = 2**63
 
 
 class Look:
@@ -81,7 +83,9 @@ class StreamChecks:
         if look is not None:
             self.unproven += not fresh_noise
             doubts += self._repetition.doubts(look.digest, fresh_noise=fresh_noise, moving=moving)
-        if stamp_ns is not None:
+        if stamp_ns is not None and not 0 <= stamp_ns < _END_NS:
+            doubts += (Reason.STAMP_IMPLAUSIBLE,)
+        elif stamp_ns is not None:
             if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
                 doubts += (Reason.STAMP_NOT_LATER,)
             self._stamp_ns = stamp_ns

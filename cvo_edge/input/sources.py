@@ -8,12 +8,12 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from operator import index
 from pathlib import Path
 from threading import Event
-from typing import SupportsIndex, TypeVar
+from typing import TypeVar
 
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.given import given_number, given_source
 from cvo_edge.input.capture import OPENING, TIMEOUT_S, Capture, Reader, shown
 from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
 from cvo_edge.input.frame import Frame, Source
@@ -81,9 +81,11 @@ def open_source(
         ``source`` is of another type, ``fps`` or ``timeout_s`` is out of range, or ``stamps`` is
         given with ``fps``, for a camera, or as ``names`` for a video.
     """
-    text = without_stdin(_text(source))
+    text = without_stdin(given_source(source))
     # What is waited for is a camera.
     live = live or patience is not None
+    fps = None if fps is None else given_number(fps, "fps")
+    timeout_s = given_number(timeout_s, "timeout")
     if fps is not None and not LOWEST_FPS <= fps <= HIGHEST_FPS:
         raise UsageError(f"fps: expected {LOWEST_FPS:g} to {HIGHEST_FPS:g}, found {fps:g}")
     if not 0.0 < timeout_s <= LONGEST_S:
@@ -125,16 +127,6 @@ def open_source(
         f"{shown(text)}: not found; expected a folder, glob, video file, camera index, device or "
         "address"
     )
-
-
-def _text(source: str | os.PathLike[str] | int) -> str:
-    try:
-        text = str(index(source)) if isinstance(source, SupportsIndex) else os.fspath(source)
-    except TypeError:
-        text = None
-    if not isinstance(text, str):
-        raise UsageError(f"source: expected a path, an address or a camera index, found {source!r}")
-    return text
 
 
 def _listed(stamps: str | None) -> ListedStamps | None:

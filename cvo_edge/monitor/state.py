@@ -19,6 +19,7 @@ from cvo_edge.bundle.format import Calibration, Sha256
 from cvo_edge.documents import one_line
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, CvoError, SinkError
 from cvo_edge.files import read_regular_file, write_whole
+from cvo_edge.given import given_path
 from cvo_edge.vocabulary import Scope
 
 # A state has about 500 bytes.
@@ -79,7 +80,7 @@ class StateFile:
         confidence: float,
         scope: Scope,
     ) -> None:
-        self.path = Path(path)
+        self.path = given_path(path, "state")
         self._name, self._digest = calibration.name, calibration.digest
         self._confidence: float = confidence
         self._scope: Scope = scope

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 from numbers import Real
-from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.documents import shown
 from cvo_edge.errors import UsageError
+from cvo_edge.given import given_path
 from cvo_edge.motion.covariance import FLOOR, SPANS_S, Shape
 from cvo_edge.motion.drift import Familiar
 from cvo_edge.motion.errors import motions
@@ -233,9 +234,9 @@ class MotionCalibration:
         self.familiar = Familiar(np.array(known.mean), np.array(known.spread), known.limit)
 
     @classmethod
-    def load(cls, path: str | Path) -> MotionCalibration:
+    def load(cls, path: str | os.PathLike[str]) -> MotionCalibration:
         """Read a file; raises CalibrationFileError."""
-        return cls(read_motion_file(Path(path)))
+        return cls(read_motion_file(given_path(path, "calibration")))
 
     def level(
         self, confidence: float = 0.9, rule: MotionRule = "mean", scope: Scope = "marginal"

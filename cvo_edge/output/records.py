@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cvo_edge.bundle.format import Calibration, Quaternion
 from cvo_edge.errors import SourceError
 from cvo_edge.estimate import Drift, PoseInterval
+from cvo_edge.given import given_path
 from cvo_edge.pose import Chart, Pose, Rotation
 from cvo_edge.record import BandsOrUnbounded, Record, RecordedRegion, SixOrUnbounded
 from cvo_edge.sets import Bands, ConformalSet, Ellipsoids, unbounded_set
@@ -166,7 +167,7 @@ class Records:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.header: Header | None = None
-        self._lines: Iterator[Header | Record] = _decoded(path)
+        self._lines: Iterator[Header | Record] = _decoded(given_path(path, "records"))
         first = next(self._lines, None)
         if isinstance(first, Header):
             self.header = first
@@ -212,9 +213,9 @@ class _Kind(Struct):
 _KIND = msgspec.json.Decoder(_Kind)
 
 
-def _decoded(path: str | os.PathLike[str]) -> Iterator[Header | Record]:
+def _decoded(path: Path) -> Iterator[Header | Record]:
     try:
-        with Path(path).open("rb") as stream:
+        with path.open("rb") as stream:
             for number, line in enumerate(stream, start=1):
                 if not line.endswith(b"\n"):
                     return

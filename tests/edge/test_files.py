@@ -64,7 +64,7 @@ def test_what_is_no_regular_file_is_refused_by_its_kind(tmp_path):
     before = len(list(Path("/proc/self/fd").iterdir()))
     for path, kind in (
         (tmp_path, "a folder"),
-        (link, "a symbolic link"),
+        (link, "a symbolic link; copy with cp -L"),
         (tmp_path / "pipe", "another kind of file"),
     ):
         with pytest.raises(SinkError, match=f"expected a regular file, found {kind}$"):

@@ -250,4 +250,4 @@ def test_the_summary_counts_images_that_are_no_frames(bundle_dir, frames, tmp_pa
         summary = RunSummary(odometer.chart.dof, 0.9, "marginal")
         run(odometer, open_source(tmp_path), lambda _: None, summary=summary)
     assert summary.frames == 1
-    assert "left out    1 image: marked depth 1" in summary.lines()
+    assert "left out    1 file: marked depth 1" in summary.lines()
