@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +17,7 @@ from cvo_edge.documents import UNWRITTEN, decode_document, encode_document, show
 from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.files import read_regular_file
 from cvo_edge.motion.horizons import Horizon
+from cvo_edge.motion.thresholds import is_supported
 from cvo_edge.motion.trace import LAGS, scale_width, tube_width
 from cvo_edge.vocabulary import MOTION_RULES, VERSION, MotionRule
 
@@ -25,10 +27,13 @@ MAX_BYTES = 64 * 1024
 # degrees of freedom at once.
 COLUMNS = ("tx", "ty", "tz", "rx", "ry", "rz", "position", "rotation", "joint")
 LEVELS = (0.5, 0.8, 0.9, 0.95, 0.99)
+# Four digits are kept.
+_ROUNDING = 0.01
 BIAS_WIDTH = 1 + 6 * (1 + LAGS)
 
 _Count = Annotated[int, Meta(ge=1)]
-_Threshold = Annotated[float, Meta(ge=0, lt=1e9)]
+# Thresholds are rounded upwards: even those of errors that are all zero are above it.
+_Threshold = Annotated[float, Meta(gt=0, lt=1e9)]
 _Form = Annotated[str, Meta(pattern=r"^[0-9.]{1,12}[fsm]$(?!\n)")]
 
 
@@ -214,9 +219,11 @@ def _check(file: MotionFile) -> None:
         _check_shape(f"{where}: unit", [window.unit], (1, 6))
         _check_shape(f"{where}: usual", [window.usual], (1, 8))
         _check_thresholds(where, window.thresholds, 3)
+        _check_counts(where, file.groups, window.recordings, window.anchors)
+        _check_supported(where, window.thresholds, window.recordings)
     sizes = 4 + len(file.columns)
     _check_shape("familiar", [file.familiar.mean, file.familiar.spread], (2, sizes))
-    width = scale_width(len(file.columns))
+    width, pointed = scale_width(len(file.columns)), file.translation == "direction"
     for spec in file.horizons:
         where = f"horizon {spec.horizon}"
         _check_name(where, spec.horizon)
@@ -229,6 +236,10 @@ def _check(file: MotionFile) -> None:
         if not _positive(symmetric(spec.shape)):
             raise CalibrationFileError(f"{where}: shape: expected a positive definite matrix")
         _check_thresholds(where, spec.thresholds, len(COLUMNS))
+        _check_counts(where, file.groups, spec.recordings, spec.motions)
+        # Without a scale, the first three mean nothing.
+        _check_supported(where, spec.thresholds, spec.recordings, 3 if pointed else 0)
+        _check_all_six(where, spec)
     quaternion = file.correction.q_xyzw
     if quaternion is not None and abs(sum(each**2 for each in quaternion) - 1.0) > 1e-6:
         raise CalibrationFileError(
@@ -298,4 +309,60 @@ def _check_thresholds(
                 raise CalibrationFileError(
                     f"{where}: expected thresholds of {rule} that do not fall from "
                     f"{low.confidence:g} to {high.confidence:g}"
+                )
+
+
+def _check_counts(where: str, groups: int, recordings: int, motions: int) -> None:
+    if not recordings <= min(groups, motions):
+        raise CalibrationFileError(
+            f"{where}: expected at most {groups} drives, each with motions, found {recordings} "
+            f"with {motions}"
+        )
+
+
+def _check_supported(
+    where: str,
+    thresholds: Sequence[ThresholdSpec | TubeThresholdSpec],
+    count: int,
+    meaningless: int = 0,
+) -> None:
+    """Check that thresholds are finite exactly if the drives allow it, and grow by the rules.
+
+    Those of the first ``meaningless`` columns are null.
+    """
+    least: dict[tuple[float, int], tuple[str, float]] = {}
+    for rule in ("mean", "tolerance", "capped", "hierarchical"):
+        for entry in (each for each in thresholds if each.rule == rule):
+            finite = is_supported(rule, entry.confidence, count)
+            for column, value in enumerate(entry.q):
+                if (value is not None) != (finite and column >= meaningless):
+                    raise CalibrationFileError(
+                        f"{where}: expected {'a number' if finite else 'null'} for {rule} at "
+                        f"{entry.confidence:g} from {count} drives, found {shown(value)} at "
+                        f"[{column}]"
+                    )
+                key, found = (entry.confidence, column), math.inf if value is None else value
+                other, low = least.get(key, ("", 0.0))
+                if found < low:
+                    raise CalibrationFileError(
+                        f"{where}: expected {rule} to be at least {other} at "
+                        f"{entry.confidence:g}, {low:g}, found {found:g} at [{column}]"
+                    )
+                if rule != "tolerance":
+                    least[key] = rule, found
+
+
+def _check_all_six(where: str, spec: HorizonSpec) -> None:
+    """Check that a set of all six degrees of freedom is as wide as that of each."""
+    for entry in spec.thresholds:
+        together = entry.q[COLUMNS.index("joint")]
+        for column, unit in enumerate(spec.joint):
+            alone = entry.q[column]
+            if together is None or alone is None:
+                continue
+            if together * unit < alone * (1.0 - _ROUNDING):
+                raise CalibrationFileError(
+                    f"{where}: expected joint thresholds of at least those of {COLUMNS[column]}, "
+                    f"{alone:g}, found {together * unit:g} for {entry.rule} at "
+                    f"{entry.confidence:g}"
                 )

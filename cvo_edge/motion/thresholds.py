@@ -37,6 +37,19 @@ _TOLERANCE = 1e-9
 _SAMPLE, _MARGIN = 1000, 30
 
 
+def within(rule: MotionRule, confidence: float, count: int) -> float:
+    """Return what the shares of ``count`` recordings up to the threshold have to add up to."""
+    wanted = confidence * count
+    if rule != "mean":
+        wanted = confidence * (count + 1) - (1.0 - (CAP if rule == "capped" else 1.0))
+    return wanted - _TOLERANCE * count
+
+
+def is_supported(rule: MotionRule, confidence: float, count: int) -> bool:
+    """Whether ``count`` recordings have a finite threshold."""
+    return rule == "tolerance" or within(rule, confidence, count) <= count
+
+
 class Scores:
     """The scores of several recordings, (n, columns) each; ``groups`` says which are one.
 
@@ -64,8 +77,8 @@ class Scores:
         for column in range(found.shape[2]):
             own = [np.concatenate([each[:, column] for each in group]) for group in self._groups]
             if single:
-                within = self._within(rules[0], levels[0])
-                found[0, 0, column] = _selected(np.concatenate(own), weights, within)
+                wanted = within(rules[0], levels[0], self.count)
+                found[0, 0, column] = _selected(np.concatenate(own), weights, wanted)
                 continue
             for each in own:
                 each.sort()
@@ -78,17 +91,10 @@ class Scores:
                     if rule == "tolerance":
                         found[row, place, column] = max(_quantile(each, level) for each in own)
                         continue
-                    index = int(np.searchsorted(shares, self._within(rule, level)))
+                    index = int(np.searchsorted(shares, within(rule, level, self.count)))
                     inside = index < len(every)
                     found[row, place, column] = every[order[index]] if inside else math.inf
         return found
-
-    def _within(self, rule: MotionRule, confidence: float) -> float:
-        """Return what the shares of recordings up to the threshold have to add up to."""
-        wanted = confidence * self.count
-        if rule != "mean":
-            wanted = confidence * (self.count + 1) - (1.0 - (CAP if rule == "capped" else 1.0))
-        return wanted - _TOLERANCE * self.count
 
 
 def _quantile(ascending: Array, confidence: float) -> float:
@@ -97,15 +103,15 @@ def _quantile(ascending: Array, confidence: float) -> float:
     return float(ascending[max(0, math.ceil(confidence * n - _TOLERANCE * n) - 1)])
 
 
-def _selected(values: Array, weights: Array, within: float) -> float:
-    """Return the least value up to which the weights of values (n,) add up to ``within``.
+def _selected(values: Array, weights: Array, wanted: float) -> float:
+    """Return the least value up to which the weights of values (n,) add up to ``wanted``.
 
     A sample says between which values it is; only those are sorted. (Floyd and Rivest 1975)
     """
     step = 1 + len(values) // _SAMPLE
     order = np.argsort(values[::step])
     sample, shares = values[::step][order], np.cumsum(weights[::step][order])
-    place = int(np.searchsorted(shares, within * shares[-1] / weights.sum()))
+    place = int(np.searchsorted(shares, wanted * shares[-1] / weights.sum()))
     margin = _MARGIN
     while True:
         low = sample[place - margin] if place >= margin else -math.inf
@@ -113,8 +119,8 @@ def _selected(values: Array, weights: Array, within: float) -> float:
         below = float(weights @ (values <= low))
         inside = np.flatnonzero((values > low) & (values <= high))
         inside = inside[np.argsort(values[inside])]
-        index = int(np.searchsorted(below + np.cumsum(weights[inside]), within))
-        if (below < within or math.isinf(low)) and index < len(inside):
+        index = int(np.searchsorted(below + np.cumsum(weights[inside]), wanted))
+        if (below < wanted or math.isinf(low)) and index < len(inside):
             return float(values[inside[index]])
         if math.isinf(low) and math.isinf(high):
             return math.inf

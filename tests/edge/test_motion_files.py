@@ -1,10 +1,11 @@
 """``motion.json``, trajectories in files, and the commands on them."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import cv2
 import msgspec
@@ -120,6 +121,72 @@ def test_a_changed_file_is_refused(file: MotionFile, key: str, value: object, me
     signed = plain.replace(b"0" * 64, sha256(plain).hexdigest().encode(), 1)
     with pytest.raises(CalibrationFileError, match=message):
         decode_motion_file(signed)
+
+
+def thresholds_changed(file: MotionFile, change: Callable[[Any, int, float], Any]) -> MotionFile:
+    """The file with other thresholds: ``change`` is given the entry, the column and the number."""
+
+    def entries(of: Any) -> Any:
+        return tuple(
+            msgspec.structs.replace(
+                each, q=tuple(q and change(each, i, q) for i, q in enumerate(each.q))
+            )
+            for each in of.thresholds
+        )
+
+    return msgspec.structs.replace(
+        file,
+        horizons=tuple(
+            msgspec.structs.replace(each, thresholds=entries(each)) for each in file.horizons
+        ),
+    )
+
+
+def counted(file: MotionFile, recordings: int) -> MotionFile:
+    horizons = tuple(msgspec.structs.replace(each, recordings=recordings) for each in file.horizons)
+    return msgspec.structs.replace(file, horizons=horizons, groups=max(recordings, file.groups))
+
+
+MOTION_LIES = {
+    "zero widths": (lambda f: thresholds_changed(f, lambda *_: 0.0), "> 0.0"),
+    "no widths": (
+        lambda f: thresholds_changed(f, lambda *_: None),
+        "expected a number for mean at 0.5 from 6 drives, found None at [0]",
+    ),
+    "one unbounded number": (
+        lambda f: thresholds_changed(
+            f, lambda e, i, q: None if (e.rule, e.confidence, i) == ("tolerance", 0.99, 6) else q
+        ),
+        "expected a number for tolerance at 0.99 from 6 drives, found None at [6]",
+    ),
+    "more drives": (lambda f: counted(f, 60), "expected a number for capped at 0.95 from 60"),
+    "fewer drives": (lambda f: counted(f, 3), "expected null for capped at 0.9 from 3 drives"),
+    "more drives than there are": (
+        lambda f: msgspec.structs.replace(f, groups=5),
+        "expected at most 5 drives, each with motions, found 6 with ",
+    ),
+    "confidences swapped": (
+        lambda f: thresholds_changed(f, lambda e, i, q: q / e.confidence**9),
+        "that do not fall from",
+    ),
+    "rules swapped": (
+        lambda f: thresholds_changed(f, lambda e, i, q: q * (0.1 if e.rule == "capped" else 1.0)),
+        "expected capped to be at least mean at 0.5",
+    ),
+    "all six narrower than one": (
+        lambda f: thresholds_changed(f, lambda e, i, q: q * (0.1 if i == 8 else 1.0)),
+        "expected joint thresholds of at least those of ",
+    ),
+}
+
+
+@pytest.mark.parametrize("lie", MOTION_LIES)
+def test_numbers_that_contradict_each_other_are_refused(file: MotionFile, lie: str) -> None:
+    tell, words = MOTION_LIES[lie]
+    with pytest.raises(CalibrationFileError) as caught:
+        encode_motion_file(tell(file))
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_horizon_has_one_name(file: MotionFile) -> None:
