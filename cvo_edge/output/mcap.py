@@ -15,13 +15,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple
 
-import msgspec
 import numpy as np
 
 from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.output.messages import Message, Placement, StoredImage, ros_image, ros_messages
-from cvo_edge.output.records import Header
+from cvo_edge.output.records import Header, flat
 
 _PROFILE = "ros2"
 # https://mcap.dev/spec: magic, then records of a kind and a length, the last one the footer.
@@ -38,6 +37,11 @@ def _libraries() -> tuple[Any, Any]:
     return writer, get_typestore(Stores.ROS2_HUMBLE)
 
 
+def _check_file(path: str) -> None:
+    if path == "-":
+        raise UsageError("mcap: expected a file, found standard output")
+
+
 class McapFile:
     """Writes messages to an MCAP file.
 
@@ -51,10 +55,12 @@ class McapFile:
     messages
         Number of messages so far.
 
-    Raises UsageError if the libraries are missing and SinkError if the file cannot be written.
+    Raises UsageError for standard output and if the libraries are missing, and SinkError if the
+    file cannot be written.
     """
 
     def __init__(self, path: str) -> None:
+        _check_file(path)
         library, self._types = _libraries()
         self._name = path
         self._channels: dict[str, int] = {}
@@ -202,8 +208,7 @@ class McapSink:
     """
 
     def __init__(self, path: str, header: Header, placement: Placement) -> None:
-        if path == "-":
-            raise UsageError("mcap: expected a file, found standard output")
+        _check_file(path)
         _libraries()
         self._path, self._header, self._placement = path, header, placement
         self._file: McapFile | None = None
@@ -227,24 +232,17 @@ class McapSink:
 
         Raises SinkError, and UsageError for a frame without a stamp.
         """
-        messages = [*ros_messages(estimate, self._placement, self._header.bundle)]
+        messages = [*ros_messages(estimate, self._placement, self._header)]
         if image is not None:
             messages.append(ros_image(estimate, self._placement, image))
         stamp_ns = estimate.stamp_ns or 0
         if self._file is None:
             # An old file is kept until there is a frame to put in its place.
             self._file = McapFile(self._path)
-            self._file.metadata("cvo-edge", _flat(self._header))
+            self._file.metadata("cvo-edge", flat(self._header))
         for message in messages:
             self._file.write(message, stamp_ns, estimate.seq)
         self._file.flush()
-
-
-def _flat(header: Header) -> dict[str, str]:
-    return {
-        key: value if isinstance(value, str) else msgspec.json.encode(value).decode()
-        for key, value in msgspec.to_builtins(header).items()
-    }
 
 
 class Recovered(NamedTuple):

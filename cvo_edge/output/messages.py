@@ -12,13 +12,14 @@ sink for other programs asks ``spoken``, and nothing else decides:
 | ``invalid`` | none | yes |
 
 There is no ``nav_msgs/Odometry``: it holds a twist, and a filter would fuse its zeros as standing
-still. Messages are nested dicts with the fields of the ROS definitions, so that they can be built
-and tested without ROS.
+still. The motion of an estimator follows the same table: its velocity has a covariance, and only an
+``ok`` step has one (``cvo_edge.motion.messages``). Messages are nested dicts with the fields of the
+ROS definitions, so that they can be built and tested without ROS.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -44,7 +45,7 @@ IMAGE = "sensor_msgs/msg/CompressedImage"
 _LARGEST_SECOND = 2**31
 _CUBE, _ADD, _DELETE_ALL = 1, 0, 3
 _COLOUR = {"r": 0.1, "g": 0.5, "b": 1.0, "a": 0.3}
-_LEVELS = {Status.OK: 0, Status.DEGRADED: 1, Status.INVALID: 2}
+LEVELS = {Status.OK: 0, Status.DEGRADED: 1, Status.INVALID: 2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,18 +114,18 @@ class Message(NamedTuple):
     content: Content
 
 
-def ros_messages(estimate: PoseInterval, placement: Placement, bundle: str) -> Iterator[Message]:
+def ros_messages(estimate: PoseInterval, placement: Placement, shared: Header) -> Iterator[Message]:
     """Yield the messages of one frame; the diagnostics come first.
 
     Raises UsageError for a frame without a stamp, or with one that ROS cannot hold.
     """
     header = ros_header(estimate, placement.frame_id)
-    yield Message("/diagnostics", DIAGNOSTICS, _diagnostics(estimate, header, bundle))
+    yield Message("/diagnostics", DIAGNOSTICS, _diagnostics(estimate, header, shared))
     said = spoken(estimate, placement)
     yield Message("/cvo/box", MARKERS, _box(estimate, header, placement, drawn=said is not None))
     if said is None:
         return
-    position, orientation = _vector(said.pose.t_m), _quaternion(said.pose.q_xyzw)
+    position, orientation = vector(said.pose.t_m), quaternion(said.pose.q_xyzw)
     pose = {"position": position, "orientation": orientation}
     covariance = {"pose": pose, "covariance": said.covariance.ravel().tolist()}
     yield Message("/cvo/pose", POSE, {"header": header, "pose": covariance})
@@ -156,22 +157,28 @@ def ros_header(estimate: PoseInterval, frame_id: str) -> Content:
 
     Raises UsageError for a frame without a stamp, or with one that ROS cannot hold.
     """
+    where = estimate.source or f"frame {estimate.seq}"
     if estimate.stamp_ns is None:
         raise UsageError(
-            f"stamp: expected one for every frame, {estimate.source or f'frame {estimate.seq}'} "
-            "has none; give --fps or --stamps"
+            f"stamp: expected one for every frame, {where} has none; give --fps or --stamps"
         )
-    seconds, nanoseconds = divmod(estimate.stamp_ns, 1_000_000_000)
+    return stamped(estimate.stamp_ns, frame_id, where)
+
+
+def stamped(stamp_ns: int, frame_id: str, where: str) -> Content:
+    """Return a ``std_msgs/Header``; raises UsageError for a stamp that ROS cannot hold."""
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     if not 0 <= seconds < _LARGEST_SECOND:
         raise UsageError(
-            f"stamp: expected one from 1970 to 2038, as ROS holds them, found "
-            f"{estimate.stamp_ns} ns at {estimate.source or f'frame {estimate.seq}'}"
+            f"stamp: expected one from 1970 to 2038, as ROS holds them, found {stamp_ns} ns at "
+            f"{where}"
         )
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame_id}
 
 
-def _diagnostics(estimate: PoseInterval, header: Content, bundle: str) -> Content:
+def _diagnostics(estimate: PoseInterval, header: Content, shared: Header) -> Content:
     values = {"seq": str(estimate.seq), "source": estimate.source}
+    values["stamps"] = shared.stamps or "source"
     values |= {f"{stage}_ms": f"{value:.3f}" for stage, value in estimate.latency_ms.items()}
     if estimate.drift.state != "unknown":
         values["drift"] = estimate.drift.state
@@ -179,10 +186,19 @@ def _diagnostics(estimate: PoseInterval, header: Content, bundle: str) -> Conten
         values["novelty"] = f"{estimate.novelty:.4f}"
     unbounded = estimate.status is Status.OK and not estimate.bounded
     said = [*estimate.reasons, *(["unbounded"] if unbounded else [])]
+    level = 1 if unbounded else LEVELS[estimate.status]
+    message = ", ".join(said) or str(estimate.status)
+    return diagnostics(header, shared.bundle, level, message, values)
+
+
+def diagnostics(
+    header: Content, name: str, level: int, message: str, values: Mapping[str, str]
+) -> Content:
+    """Return a ``diagnostic_msgs/DiagnosticArray`` with one status."""
     status = {
-        "level": 1 if unbounded else _LEVELS[estimate.status],
-        "name": f"cvo-edge: {bundle}",
-        "message": ", ".join(said) or str(estimate.status),
+        "level": level,
+        "name": f"cvo-edge: {name}",
+        "message": message,
         "hardware_id": "",
         "values": [{"key": key, "value": value} for key, value in values.items()],
     }
@@ -207,15 +223,17 @@ def _marker(header: Content, number: int, action: int, pose: Pose, size: Array) 
         "id": number,
         "type": _CUBE,
         "action": action,
-        "pose": {"position": _vector(pose.t_m), "orientation": _quaternion(pose.q_xyzw)},
-        "scale": _vector(size),
+        "pose": {"position": vector(pose.t_m), "orientation": quaternion(pose.q_xyzw)},
+        "scale": vector(size),
         "color": _COLOUR,
     }
 
 
-def _vector(values: Array) -> Content:
+def vector(values: Array) -> Content:
+    """Return a ``geometry_msgs/Vector3`` or ``Point``."""
     return dict(zip("xyz", values.tolist(), strict=True))
 
 
-def _quaternion(q_xyzw: Array) -> Content:
+def quaternion(q_xyzw: Array) -> Content:
+    """Return a ``geometry_msgs/Quaternion``."""
     return dict(zip("xyzw", q_xyzw.tolist(), strict=True))

@@ -100,6 +100,14 @@ def header_of(
     )
 
 
+def flat(header: Struct) -> dict[str, str]:
+    """Return the fields of a header as text; those that are none become JSON."""
+    return {
+        key: value if isinstance(value, str) else msgspec.json.encode(value).decode()
+        for key, value in msgspec.to_builtins(header).items()
+    }
+
+
 def estimate_of(record: Record, header: Header) -> PoseInterval:
     """Return the estimate that a record was written from; its drift has no reason.
 

@@ -8,10 +8,18 @@ from pathlib import Path
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.files import whole_path
-from cvo_edge.output.mcap import McapSink, recover
+from cvo_edge.motion.messages import (
+    CHILD_FRAME_ID,
+    FRAME_ID,
+    motion_header_of,
+    motion_messages,
+    read_motion_records,
+)
+from cvo_edge.motion.records import MotionHeader
+from cvo_edge.output.mcap import McapFile, McapSink, recover
 from cvo_edge.output.messages import Placement, StoredImage
 from cvo_edge.output.opening import PLACED, open_sink
-from cvo_edge.output.records import Header, estimate_of, read_records
+from cvo_edge.output.records import Header, estimate_of, flat, read_records
 from cvo_edge.output.rerun import RerunSink
 from cvo_edge.pose import Pose
 from cvo_edge.vocabulary import Format
@@ -67,6 +75,16 @@ def convert(
     unknown_variance: float | None,
 ) -> int:
     """Write records to another format; returns their number. Raises CvoError."""
+    of_motion = motion_header_of(source)
+    if of_motion is not None:
+        if format != "mcap" or any(
+            each is not None for each in (images, base, map, unknown_variance)
+        ):
+            raise UsageError(
+                f"{source}: expected -o FILE.mcap with --frame-id and --child-frame-id alone for "
+                "records of motion"
+            )
+        return _convert_motion(source, of_motion, output, frame_id, child_frame_id)
     records = read_records(source)
     header = records.header
     if header is None:
@@ -87,6 +105,24 @@ def convert(
                 sink.write(estimate, _image(estimate, images))
             else:
                 sink.write(estimate)
+            count += 1
+    return count
+
+
+def _convert_motion(
+    source: Path,
+    header: MotionHeader,
+    output: str,
+    frame_id: str | None,
+    child_frame_id: str | None,
+) -> int:
+    count = 0
+    names = frame_id or FRAME_ID, child_frame_id or CHILD_FRAME_ID
+    with whole_path(output) as name, McapFile(name) as file:
+        file.metadata("cvo-edge", flat(header))
+        for record, messages in motion_messages(read_motion_records(source), header, *names):
+            for message in messages:
+                file.write(message, record.stamp_ns, record.seq)
             count += 1
     return count
 

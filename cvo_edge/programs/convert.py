@@ -70,7 +70,7 @@ def convert(
         Path,
         typer.Argument(
             metavar="RECORDS",
-            help="JSON lines of run; with --recover, an MCAP file.",
+            help="JSON lines of run or annotate; with --recover, an MCAP file.",
             readable=False,
             show_default=False,
         ),

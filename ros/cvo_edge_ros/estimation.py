@@ -172,7 +172,7 @@ def answers(
         moving = True if settings.always_moving else None
         before = None
         for estimate in odometer.stream(frames, moving=moving):
-            found = list(ros_messages(estimate, placement or Placement.of(header), header.bundle))
+            found = list(ros_messages(estimate, placement or Placement.of(header), header))
             if not settings.publish_tf:
                 found = [each for each in found if each.type != TRANSFORM]
             said = estimate.status, estimate.reasons

@@ -35,7 +35,7 @@ PAGES = sorted(
 )
 SHELLS, CLASSES = ("sh", "console", "bash", "shell"), ("run", "train", "tutorial", "parse")
 COMMANDS = {"cvo-edge": get_command(edge_app), "cvo-export": get_command(export_app)}
-OTHERS = ("openssl", "ray", "git", "colcon", "ros2", "evo_traj", "ffmpeg")
+OTHERS = ("openssl", "ray", "git", "colcon", "ros2", "evo_traj", "ffmpeg", "my-consumer")
 # Options that reduce a command's work; the last occurrence of an option counts.
 SMALL = {
     ("cvo-edge", "run"): ["--max-frames", "4"],

@@ -93,7 +93,7 @@ def test_one_rule_says_what_a_frame_may_say(estimate, quiet, loud, level):
     for placement, given in ((HERE, quiet), (LOUD, loud)):
         said = spoken(estimate, placement)
         assert (said is not None) == given
-        messages = {each.topic: each.content for each in ros_messages(estimate, placement, "b")}
+        messages = {each.topic: each.content for each in ros_messages(estimate, placement, HEADER)}
         assert ("/cvo/pose" in messages) == ("/tf" in messages) == given
         assert messages["/diagnostics"]["status"][0]["level"] == level
         boxes = len(messages["/cvo/box"]["markers"]) - 1
@@ -105,7 +105,7 @@ def test_one_rule_says_what_a_frame_may_say(estimate, quiet, loud, level):
 
 def test_a_set_in_pieces_is_several_boxes():
     bands = (((0.9, 0.95), (1.0, 1.02)), *(((2.0, 2.1),), ((3.0, 3.1),)), *((((0.0, 0.1),),) * 3))
-    messages = {each.topic: each.content for each in ros_messages(frame(bands=bands), HERE, "b")}
+    messages = {each.topic: each.content for each in ros_messages(frame(bands=bands), HERE, HEADER)}
     _, first, second = messages["/cvo/box"]["markers"]
     assert [first["scale"]["x"], second["scale"]["x"]] == pytest.approx([0.05, 0.02])
     assert [first["id"], second["id"]] == [0, 1]
@@ -114,7 +114,7 @@ def test_a_set_in_pieces_is_several_boxes():
 @pytest.mark.parametrize("stamp_ns", [None, -1, 2**31 * 10**9])
 def test_a_stamp_that_ros_cannot_hold_is_refused(stamp_ns):
     with pytest.raises(UsageError, match="stamp: expected one"):
-        list(ros_messages(replace(frame(), stamp_ns=stamp_ns), HERE, "b"))
+        list(ros_messages(replace(frame(), stamp_ns=stamp_ns), HERE, HEADER))
 
 
 def test_a_record_gives_its_estimate_back(tmp_path):

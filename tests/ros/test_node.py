@@ -222,9 +222,10 @@ def test_the_node_says_what_the_table_says(bundle_dir, clip_dir):
         ]
         sent.append(image_message(WIDE, "16UC1", stamp_ns=stamps[3]))
         chart, calibration = odometer.chart, odometer.calibration
-        placement = Placement.of(header_of(calibration, chart, 0.9, "marginal"))
+        shared = header_of(calibration, chart, 0.9, "marginal")
+        placement = Placement.of(shared)
         expected = [
-            list(ros_messages(odometer.step(image, stamp, "camera"), placement, calibration.name))
+            list(ros_messages(odometer.step(image, stamp, "camera"), placement, shared))
             for image, stamp in zip([*images, None], stamps, strict=True)
         ]
     given = [
