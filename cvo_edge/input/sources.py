@@ -16,6 +16,7 @@ from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.given import given_number, given_source
 from cvo_edge.input.capture import OPENING, TIMEOUT_S, Capture, Reader, shown
 from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
+from cvo_edge.input.followed import FollowedFolder
 from cvo_edge.input.frame import Frame, Source
 from cvo_edge.input.image_files import (
     IMAGE_SUFFIXES,
@@ -42,12 +43,13 @@ T = TypeVar("T")
 def open_source(
     source: str | os.PathLike[str] | int,
     fps: float | None = None,
-    timeout_s: float = TIMEOUT_S,
+    timeout_s: float | None = None,
     stamps: str | None = None,
     patience: Patience | None = None,
     threads: int | None = None,
     *,
     live: bool = False,
+    follow: bool = False,
 ) -> Source:
     """Open a folder of images, a glob, a video file, a pipe, a camera or a stream.
 
@@ -61,7 +63,9 @@ def open_source(
     fps
         Frames per second to stamp frames with, starting at zero, instead of the source's own.
     timeout_s
-        Longest wait for the next frame of a video or camera; opening may take twice as long.
+        Longest wait for the next frame of a video or camera, by default five seconds; opening may
+        take twice as long. A folder that is followed ends after so long without a new image, by
+        default never.
     stamps
         Where the stamps are: ``names`` of image files, or a file such as ``rgb.txt``, ``data.csv``
         or ``times.txt``, also for a video (see ``cvo_edge.input.stamps``).
@@ -71,23 +75,28 @@ def open_source(
         Most threads of a video's decoder; by default one per core.
     live
         Whether a pipe is a camera's: its frames are then stamped as they arrive and grow old, and
-        a named pipe is opened again for its next writer. Else it is a recording.
+        a named pipe is opened again for its next writer. Else it is a recording. Images of a folder
+        that is followed then grow old, too.
+    follow
+        Whether to wait for new images in a folder, see ``FollowedFolder``.
 
     Raises
     ------
     SourceError
         There is no such source, or it holds no image.
     UsageError
-        ``source`` is of another type, ``fps`` or ``timeout_s`` is out of range, or ``stamps`` is
-        given with ``fps``, for a camera, or as ``names`` for a video.
+        ``source`` is of another type, ``fps`` or ``timeout_s`` is out of range, ``stamps`` is given
+        with ``fps``, for a camera, or as ``names`` for a video, or ``follow`` for anything but a
+        folder.
     """
     text = without_stdin(given_source(source))
     # What is waited for is a camera.
     live = live or patience is not None
     fps = None if fps is None else given_number(fps, "fps")
-    timeout_s = given_number(timeout_s, "timeout")
     if fps is not None and not LOWEST_FPS <= fps <= HIGHEST_FPS:
         raise UsageError(f"fps: expected {LOWEST_FPS:g} to {HIGHEST_FPS:g}, found {fps:g}")
+    quiet_s = None if timeout_s is None else given_number(timeout_s, "timeout")
+    timeout_s = TIMEOUT_S if quiet_s is None else quiet_s
     if not 0.0 < timeout_s <= LONGEST_S:
         raise UsageError(f"timeout: expected up to {LONGEST_S:g} s, found {timeout_s:g}")
     if stamps is not None and fps is not None:
@@ -97,6 +106,9 @@ def open_source(
         path.exists()
     except OSError as error:
         raise SourceError(f"{shown(text)}: not a usable name: {error.strerror}") from None
+    if follow:
+        _check_followed(path, stamps)
+        return FollowedFolder(path, fps, quiet_s, live=live, patience=patience)
     if path.is_dir():
         return ImageFiles(
             images_in(path), fps, f"{shown(text)}: expected images, found none", stamps
@@ -127,6 +139,20 @@ def open_source(
         f"{shown(text)}: not found; expected a folder, glob, video file, camera index, device or "
         "address"
     )
+
+
+def _check_followed(path: Path, stamps: str | None) -> None:
+    if stamps is not None:
+        raise UsageError(
+            "stamps: expected none for a folder that is followed, whose stamps are those in names "
+            f"or of fps, found {stamps}"
+        )
+    if not path.exists():
+        raise SourceError(
+            f"{shown(str(path))}: expected a folder to follow, found none; create it first"
+        )
+    if not path.is_dir():
+        raise UsageError(f"follow: expected a folder of images, found {shown(str(path))}")
 
 
 def _listed(stamps: str | None) -> ListedStamps | None:

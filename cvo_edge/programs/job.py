@@ -49,7 +49,7 @@ class Wanted:
     confidence: float
     scope: Scope
     camera: Path | None
-    timeout: float
+    timeout: float | None
     mode: Mode | None
     threads: int | None
     cache: bool
@@ -61,6 +61,7 @@ class Wanted:
     placing: tuple[str | None, str | None, str | None, str | None, float | None]
     fps: float | None = None
     stamps: str | None = None
+    follow: bool = False
     adapt: bool = False
     view: bool = False
 
@@ -98,6 +99,8 @@ def opened(
     ``patience`` is for a camera, ``around`` opens a sink by its name and its opening, ``counts``
     are added to the metrics.
     """
+    if wanted.follow and wanted.mode == "throughput":
+        raise UsageError("--follow: expected the mode latency or live, found throughput")
     frames = open_source(
         wanted.source,
         wanted.fps,
@@ -106,6 +109,7 @@ def opened(
         patience,
         wanted.threads,
         live=wanted.mode == "live",
+        follow=wanted.follow,
     )
     with (
         Odometer.load(

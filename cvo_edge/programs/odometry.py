@@ -17,6 +17,7 @@ from cvo_edge.programs.motion import ConfidenceOption, RuleOption, ScopeOption
 from cvo_edge.programs.options import (
     INTERVALS,
     REPORT,
+    FollowOption,
     ForceOption,
     MaxFramesOption,
     OutputOption,
@@ -105,7 +106,8 @@ def odometry(
     ] = None,
     stamps: StampsOption = None,
     max_frames: MaxFramesOption = None,
-    timeout: TimeoutOption = 5.0,
+    follow: FollowOption = False,
+    timeout: TimeoutOption = None,
 ) -> None:
     """Estimate rotation and direction of a camera's motion, frame by frame, without a network."""
     import cv2
@@ -123,7 +125,7 @@ def odometry(
     calibrated = checked_camera(read_camera(camera))
     tracker = _tracker(motion, written_as, scale, confidence, rule, scope)
     lengths = None if scale is None else _lengths(scale, fps)
-    frames = open_source(source, fps, timeout, stamps)
+    frames = open_source(source, fps, timeout, stamps, follow=follow)
     front = FrontEnd(calibrated, lengths)
     stamped = written_as == "tum" or scale is not None or tracker is not None
     first = _heading(calibrated, scale, written_as, tracker)

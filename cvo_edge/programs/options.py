@@ -170,10 +170,20 @@ MaxFramesOption = Annotated[
     ),
 ]
 TimeoutOption = Annotated[
-    float,
+    float | None,
     typer.Option(
         "--timeout",
-        help="Seconds to wait for the next frame of a camera or video.",
+        help="Seconds to wait for the next frame of a camera or video; default: 5. With --follow: "
+        "end after so long without a new image; default: never.",
+        show_default=False,
+        rich_help_panel="Input",
+    ),
+]
+FollowOption = Annotated[
+    bool,
+    typer.Option(
+        "--follow",
+        help="Wait for new images in the folder, until --timeout or a signal.",
         rich_help_panel="Input",
     ),
 ]

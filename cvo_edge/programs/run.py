@@ -16,6 +16,7 @@ from cvo_edge.camera_check import LensEstimate
 from cvo_edge.estimate import Drift, PoseInterval
 from cvo_edge.ground_truth import GroundTruth
 from cvo_edge.ground_truth.found import Key
+from cvo_edge.input.followed import FollowedFolder
 from cvo_edge.input.frame import Source
 from cvo_edge.input.image_files import ImageFiles, left_out_text
 from cvo_edge.monitor.adaptation import Adapted
@@ -228,7 +229,7 @@ def run(
     ``expect_motion``, a picture that stands still is a doubt. ``tick`` gets each frame at last.
     The odometer gets the labels whose time has come after each estimate.
     """
-    if isinstance(frames, ImageFiles):
+    if isinstance(frames, ImageFiles | FollowedFolder):
         summary.left_out = frames.left_out
     summary.labels = labels
     try:

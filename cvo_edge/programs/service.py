@@ -12,6 +12,7 @@ from threading import Event, Thread
 
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
+from cvo_edge.input.followed import FollowedFolder
 from cvo_edge.input.sources import Camera
 from cvo_edge.input.waiting import Waiting
 from cvo_edge.output.dropping import Dropping
@@ -236,5 +237,5 @@ class Service:
         return alive
 
 
-def _camera(job: Job) -> Camera | None:
-    return job.frames if isinstance(job.frames, Camera) else None
+def _camera(job: Job) -> Camera | FollowedFolder | None:
+    return job.frames if isinstance(job.frames, Camera | FollowedFolder) else None
