@@ -59,7 +59,9 @@ def find_bag_poses(place: Path, options: Mapping[str, str]) -> Found:
         if invalid == len(track.valid):
             raise SourceError(f"{path}: expected poses ({poses.text}), found no valid one")
         if invalid:
-            skipped.add("invalid pose", count=invalid)
+            bad_ns = int(track.stamps_ns[~track.valid][0])
+            at = f"{path.name}, pose at {bad_ns // 10**9}.{bad_ns % 10**9:09d}"
+            skipped.add("invalid pose", at, invalid)
     first_ns, last_ns = poses.span_ns.tolist()
     return interpolated(poses.at, first_ns, last_ns, skipped, poses.text)
 

@@ -296,8 +296,9 @@ def _level_lines(
         width = np.array(level["median_width"])
         lines.append(
             f"{level['confidence']:<8g}{level['scope']:<12}{coverage}"
-            f"{level['joint_coverage']:>7.3f}{shown:>16}{100 * width[kinds[0]].mean():>10.2f}"
-            f"{np.rad2deg(width[kinds[1]].mean()):>7.2f}{level['normalised_interval_score']:>8.3f}"
+            f"{level['joint_coverage']:>7.3f}{shown:>16}{_cell(100 * width[kinds[0]].mean(), 10)}"
+            f"{_cell(np.rad2deg(width[kinds[1]].mean()), 7)}"
+            f"{_cell(level['normalised_interval_score'], 8, 3)}"
         )
     for level in levels:
         if level["confidence"] == 0.9 and "disjoint_share" in level:
@@ -322,6 +323,12 @@ def _level_lines(
     if not all(level["coverage_band_exact"] for level in levels):
         lines.append(footnote)
     return lines + _proven_lines(levels)
+
+
+def _cell(value: float, width: int, decimals: int = 2) -> str:
+    """Return a number that never touches the column before, however large it is."""
+    text = f"{value:.{decimals}f}"
+    return f"{text if len(text) < width else f'{value:.1g}':>{width}}"
 
 
 def _sequence_lines(sequences: Mapping[str, Any]) -> list[str]:

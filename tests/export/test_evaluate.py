@@ -130,6 +130,15 @@ def test_table_shows_every_level(report):
     assert text.count("-   ") >= 2  # unbounded sets have no band
 
 
+def test_columns_stay_apart_however_large_a_number_is(report):
+    level = {**report["levels"][0], "median_width": [1e7] * 6, "normalised_interval_score": 1e9}
+    found = table({**report, "still": [], "levels": [level]})
+    row = next(
+        line for line in found if line.startswith(f"{level['confidence']:<8g}{level['scope']}")
+    )
+    assert row.split()[-3:] == ["1e+09", "6e+08", "1e+09"]
+
+
 def test_labels_bring_coverage_back_after_a_change(tiny_bundle, tiny_run, monkeypatch):
     monkeypatch.setattr("cvo_export.bundles.online._LEAST", 400)
     schedule, dark = parse_schedule("every=5,delay=3"), parse_noise("exposure:-3")

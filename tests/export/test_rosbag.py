@@ -512,7 +512,9 @@ def test_a_bag_alone_or_in_its_folder_is_ground_truth(tmp_path):
     frames = [frames_of(tmp_path / "frames", path, "/cam/image_raw")]
     for place in (path, tmp_path / "bags", f"rosbag:{tmp_path / 'bags'}"):
         truth = same_as_training(f"rosbag:{path}", frames, place)
-        assert str(truth.skipped) == "skipped 1: invalid pose 1"
+        assert str(truth.skipped) == (
+            "skipped 1: invalid pose 1 (first in walk, pose at 1700000000.205000000)"
+        )
         assert truth.spans(None, None).startswith("frames without a stamp, poses at 1700000000.005")
     write(tmp_path / "bags" / "other", "mcap", rows)
     with pytest.raises(SourceError, match=r"expected the bag .*, found other.mcap, walk; name one"):

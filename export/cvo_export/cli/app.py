@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cvo_edge.process import Terminated, say
 from cvo_edge.vocabulary import Joint, Rule, Sides, SplitKind
 
 if TYPE_CHECKING:
     from cvo_export.datasets import PoseDataset
+
+
+@contextmanager
+def resumable() -> Iterator[None]:
+    """Say that work which is interrupted here is not lost."""
+    try:
+        yield
+    except (KeyboardInterrupt, Terminated):
+        say("interrupted: the same command goes on from what is done")
+        raise
+
 
 app = typer.Typer(
     rich_markup_mode="rich",

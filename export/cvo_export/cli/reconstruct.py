@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cvo_edge.programs.options import examples
-from cvo_export.cli.app import DATA, app
+from cvo_export.cli.app import DATA, app, resumable
 
 SCALE = "Metric scale (one of)"
 
@@ -92,6 +92,6 @@ def reconstruct(
         distance=distance,
         known_poses=known_poses,
     )
-    with show_progress() as progress:
+    with resumable(), show_progress() as progress:
         report = run(recordings, scene, options, progress)
     print(*report_lines(report), sep="\n")

@@ -21,6 +21,7 @@ from cvo_export.cli.app import (
     TrainingSplitOption,
     WeightsOption,
     app,
+    resumable,
 )
 from cvo_export.progress import show_progress
 from cvo_export.vocabulary import StudyEngine
@@ -74,7 +75,7 @@ def compare(
         copies=copies,
         steps=steps,
     )
-    with show_progress() as progress:
+    with resumable(), show_progress() as progress:
         lines = compare_methods(
             preset,
             CellFolder.in_folder(out, cache),
@@ -115,7 +116,8 @@ def study(
     template = page_template()
     grids = read_study(config)
     local = nullcontext(partial(run_tasks, jobs or allowed_cores()))
-    with local if engine == "local" else ray_engine() as run, show_progress() as progress:
+    engine_run = local if engine == "local" else ray_engine()
+    with resumable(), engine_run as run, show_progress() as progress:
         folder = CellFolder.in_folder(out, cache)
         say = partial(print, file=sys.stderr, flush=True)
         results = run_study(grids, folder, run, progress, say)

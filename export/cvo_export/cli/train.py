@@ -26,6 +26,7 @@ from cvo_export.cli.app import (
     WeightsOption,
     app,
     opened,
+    resumable,
 )
 from cvo_export.progress import show_progress
 from cvo_export.vocabulary import Normalisation
@@ -145,7 +146,7 @@ def _train(
         noise=noise,
         head=options,
     )
-    with show_progress() as progress:
+    with resumable(), show_progress() as progress:
         run = train(run_dir, config, progress, cache)
     print(*run.lines(), sep="\n", file=sys.stderr)
 

@@ -9,7 +9,6 @@ Images and poses are compared by the stamps in their headers.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,6 +26,7 @@ from cvo_edge.trajectories.bag_transforms import frame_name
 from cvo_edge.trajectories.interpolation import Stamps
 from cvo_edge.trajectories.path_options import path_options
 from cvo_edge.trajectories.poses import matrix_to_pose
+from cvo_edge.trajectories.trajectory import Skipped
 from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS
 from cvo_export.datasets.bag_cameras import bag_camera
 from cvo_export.datasets.base import PoseDataset, skipped_text
@@ -62,7 +62,7 @@ def open_rosbag(path: str) -> PoseDataset:
     stamps: list[int] = []
     names: list[str] = []
     sequence: list[str] = []
-    skipped: Counter[str] = Counter()
+    skipped = Skipped()
     cameras, worlds, spans = {}, {}, []
     chosen = ""
     for name, bag_path in find_bags(root).items():
@@ -79,11 +79,11 @@ def open_rosbag(path: str) -> PoseDataset:
             frame_id = f"{name}/{stamp // 10**9}.{stamp % 10**9:09d}"
             pose = matrix_to_pose(T) if near else None
             if not near:
-                skipped[f"no pose within {MAX_STAMP_DIFFERENCE_NS / 1e9:g} s"] += 1
+                skipped.add(f"no pose within {MAX_STAMP_DIFFERENCE_NS / 1e9:g} s")
             elif pose is None:
-                skipped["invalid pose"] += 1
+                skipped.add("invalid pose", f"{bag.path.name}, image at {frame_id}")
             elif names and names[-1] == frame_id:
-                skipped["stamp twice"] += 1
+                skipped.add("stamp twice")
             else:
                 images.append(image)
                 poses.append(pose)
@@ -106,7 +106,7 @@ def open_rosbag(path: str) -> PoseDataset:
         frame_names=tuple(names),
         read_image=lambda index: _read(images[index]),
         image_size=lambda index: images[index].size,
-        skipped=dict(skipped),
+        skipped=skipped,
         stamps_ns=np.array(stamps),
         chosen=chosen,
     )
@@ -114,14 +114,14 @@ def open_rosbag(path: str) -> PoseDataset:
     return dataset if camera is None else replace(dataset, intrinsics=camera[0], lens=camera[1])
 
 
-def _index(bag: Bag, topic: str, skipped: Counter[str]) -> tuple[list[_Image], Stamps, str]:
+def _index(bag: Bag, topic: str, skipped: Skipped) -> tuple[list[_Image], Stamps, str]:
     """Return where the readable images are, their stamps in ascending order, and their frame."""
     rows: list[tuple[int, _Image]] = []
     frame = ""
     for message in bag.messages(topic):
         size = message_size(message.content)
         if size is None:
-            skipped["unreadable image"] += 1
+            skipped.add("unreadable image")
             continue
         frame = frame or frame_name(message.content.header.frame_id)
         place = _Image(bag, topic, message.received_ns, message.number, size)

@@ -74,7 +74,9 @@ def _add_recording(
     for (stamp_ns, file), T, found in zip(rows, T_world_imu @ T_imu_camera, near, strict=True):
         if found:
             image = images / file
-            frames.add(name, image.stem, image, matrix_to_pose(T), stamp_ns)
+            pose = matrix_to_pose(T)
+            where = "" if pose is not None else f"the poses about {stamp_ns} ns"
+            frames.add(name, image.stem, image, pose, stamp_ns, where)
         else:
             frames.skip(f"no pose within {MAX_STAMP_DIFFERENCE_NS / 1e9:g} s")
     if near.all():
