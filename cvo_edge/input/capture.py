@@ -6,11 +6,13 @@ therefore waits for the thread's answer, for a bounded time. The thread is a dae
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import math
 import os
 import re
 import select
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -54,6 +56,7 @@ _INTRA = frozenset(
 # Attempts that never answered, in this process. Each keeps a thread.
 _MOST_HANGING = 16
 _hanging: WeakSet[Thread] = WeakSet()
+_reading: WeakSet[Thread] = WeakSet()
 
 T = TypeVar("T")
 
@@ -153,6 +156,7 @@ class Capture:
         make = video or cv2.VideoCapture
         arguments = (self._calls, self._answers, self._idle, clock, threads, make)
         thread = Thread(target=_work, args=arguments, name=READER, daemon=True)
+        _reading.add(thread)
         try:
             thread.start()
         except RuntimeError as error:
@@ -252,6 +256,18 @@ def _end(
     # A thread that hangs is not waited for; the finalizer may also run in the thread itself.
     if idle.is_set() and thread is not current_thread():
         thread.join(_RELEASE_S)
+
+
+@atexit.register
+def _await_readers() -> None:
+    """Let reads of closed captures come to their end when Python exits: at most one gap each.
+
+    Python would end their threads inside OpenCV and abort. Those that hang are not waited for.
+    """
+    late = time.monotonic() + _RELEASE_S
+    for thread in set(_reading) - set(_hanging):
+        if thread.is_alive():
+            thread.join(max(0.0, late - time.monotonic()))
 
 
 class _Stated(NamedTuple):

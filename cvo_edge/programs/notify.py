@@ -24,6 +24,7 @@ class Notifier:
         address = environment.get("NOTIFY_SOCKET", "")
         # An abstract address begins with a zero byte, which a variable cannot hold.
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
+        self._stopping = False
         limit_us = environment.get("WATCHDOG_USEC", "")
         mine = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.watchdog_s = 1e-6 * int(limit_us) if mine and limit_us.isdecimal() else None
@@ -45,8 +46,10 @@ class Notifier:
         self._tell("WATCHDOG=1")
 
     def stopping(self) -> None:
-        """Say that the service ends."""
-        self._tell("STOPPING=1")
+        """Say that the service ends, once."""
+        if not self._stopping:
+            self._tell("STOPPING=1")
+        self._stopping = True
 
     def _tell(self, *lines: str) -> None:
         if not self._address:
