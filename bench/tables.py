@@ -26,6 +26,7 @@ import odometry_tables
 import promised_table
 import reconstruct_tables
 import recording_tables
+import service_tables
 import speed_tables
 import study_tables
 import vigilance_tables
@@ -60,6 +61,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **odometry_tables.TABLES,
     **recording_tables.TABLES,
     **reconstruct_tables.TABLES,
+    **service_tables.TABLES,
     "faults": faults,
     "goals": goals_table,
     "results": results_index,
