@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -42,7 +43,9 @@ app = typer.Typer(
 MOST_MEASURED = 10**7
 
 
-@app.command("demo")
+@app.command(
+    "demo", epilog=examples("cvo-edge demo", "cvo-edge demo my-bundle --picture my-bundle.png")
+)
 def demonstrate(
     bundle: Annotated[
         Path | None,
@@ -176,19 +179,32 @@ def drift(
         raise GateError(f"drift: expected a martingale of at most {max_martingale:g}, {found}")
 
 
-for command in (
-    convert,
-    odometry,
-    conformalize,
-    annotate,
-    audit,
-    verify,
-    inspect,
-    schema,
-    doctor,
-    cache,
-):
-    app.command()(command)
+_SHOWN: dict[Callable[..., None], tuple[str, ...]] = {
+    convert: (
+        "cvo-edge convert flight.jsonl -o flight.mcap --images recordings/flight-07",
+        "cvo-edge convert flight.jsonl --to rrd",
+    ),
+    odometry: (
+        "cvo-edge odometry drive.mp4 --camera camera.json -o steps.jsonl",
+        "cvo-edge odometry images/ --camera sensor.yaml --scale wheels.tum",
+    ),
+    conformalize: (
+        "cvo-edge conformalize a-est.tum a-gt.tum b-est.tum b-gt.tum -o motion.json",
+        "cvo-edge conformalize --pairs drives.txt -o motion.json",
+    ),
+    annotate: (
+        "cvo-edge annotate estimate.tum motion.json -o intervals.jsonl",
+        "my-estimator | cvo-edge annotate - motion.json",
+    ),
+    audit: ("cvo-edge audit --pairs held-out.txt motion.json --picture audit.png",),
+    verify: ("cvo-edge verify my-bundle", "cvo-edge verify my-bundle --public-key key.pem"),
+    inspect: ("cvo-edge inspect my-bundle", "cvo-edge inspect my-bundle --json"),
+    schema: ("cvo-edge schema > calibration.schema.json",),
+    doctor: ("cvo-edge doctor",),
+    cache: ("cvo-edge cache", "cvo-edge cache --clear"),
+}
+for command, shown in _SHOWN.items():
+    app.command(epilog=examples(*shown))(command)
 
 
 def _version(wanted: bool) -> None:

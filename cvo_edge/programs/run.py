@@ -174,10 +174,10 @@ class RunSummary:
         if self.compared:
             share = self.covered / self.compared
             lines.append(
-                "coverage".ljust(len(lines[-1]) - 54)
-                + "".join(f"{value:>9.3f}" for value in share)
-                + f"   all six {self.covered_jointly / self.compared:.3f} of {self.compared} frames"
+                "coverage".ljust(len(lines[-1]) - 54) + "".join(f"{value:>9.3f}" for value in share)
             )
+            six = self.covered_jointly / self.compared
+            lines.append(f"all six     {six:.3f} of {self.compared} frames")
         return lines
 
 

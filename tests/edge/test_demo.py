@@ -51,7 +51,7 @@ def test_it_needs_nothing_but_the_package_and_leaves_nothing_but_a_picture(tmp_p
     assert lines[0].startswith("synthetic-room-scr-int8: digests match")
     shown = [line.split()[0] for line in lines if line.startswith(("frame-", "..."))][:5]
     assert shown == [*(f"frame-{number:06}" for number in range(4)), "..."]
-    (coverage,) = [line for line in lines if line.startswith("coverage")]
+    (coverage,) = [line for line in lines if line.startswith("all six")]
     assert coverage.endswith("of 45 frames")
     plain, _, hand = done.stdout.partition("\nhand")
     assert hand

@@ -172,7 +172,7 @@ def calibrate(
     print(*inspect_lines(calibration), sep="\n")
 
 
-@app.command()
+@app.command(epilog=examples("cvo-export sign bundles/kitchen --key key.pem --bundle-version 7"))
 def sign(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
     key: Annotated[Path, typer.Option(help="Ed25519 private key (PEM).", show_default=False)],

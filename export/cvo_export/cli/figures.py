@@ -92,7 +92,9 @@ def evaluate(
         check_coverage(report, min_coverage)
 
 
-@app.command()
+@app.command(
+    epilog=examples("cvo-export plot bundles/kitchen 7scenes:scenes/kitchen --out tube.png")
+)
 def plot(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder.", show_default=False)],
     dataset: DatasetArgument,
@@ -126,7 +128,7 @@ def plot(
     print(out)
 
 
-@app.command()
+@app.command(epilog=examples("cvo-export render synthetic:room frames --sequence flight-00"))
 def render(
     dataset: DatasetArgument,
     folder: Annotated[Path, typer.Argument(help="New folder.", show_default=False)],

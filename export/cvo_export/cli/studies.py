@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from cvo_edge.errors import UsageError
+from cvo_edge.programs.options import examples
 from cvo_export.cli.app import (
     BackboneOption,
     CopiesOption,
@@ -27,7 +28,11 @@ from cvo_export.progress import show_progress
 from cvo_export.vocabulary import StudyEngine
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "cvo-export compare 7scenes:scenes/kitchen comparison --methods cjp,scr --seeds 5"
+    )
+)
 def compare(
     dataset: DatasetArgument,
     out: Annotated[
@@ -86,7 +91,12 @@ def compare(
     print(*lines, sep="\n")
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "cvo-export study grids.toml my-study",
+        "cvo-export study grids.toml my-study --engine ray",
+    )
+)
 def study(
     config: Annotated[Path, typer.Argument(help="Grids to run, TOML.", show_default=False)],
     out: Annotated[Path, typer.Argument(help="New folder, or the folder of a study to resume.")],
