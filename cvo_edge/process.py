@@ -6,6 +6,7 @@ Both command lines run in ``guarded``; importing this module has no side effects
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -19,7 +20,7 @@ import typer
 from typer.main import get_command
 
 from cvo_edge.errors import CvoError, SinkError, SourceError, printable
-from cvo_edge.output.lines import reopen_files
+from cvo_edge.output.named import reopen_files
 
 # How long regular cleanup after a signal may take.
 _PATIENCE_S = 0.8
@@ -64,14 +65,14 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
     for number in _MEANINGLESS:
         if signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, _terminate)
-    if sys.stdout is not None:
+    if sys.stdout is None:
+        sys.stdout = _Closed()
+    else:
         # Escape characters that the terminal's character set lacks.
         with contextlib.suppress(AttributeError):
             sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     command = get_command(app)
     try:
-        if sys.stdout is None:
-            raise SinkError("standard output: closed; redirect it to a file or /dev/null")
         if f"_{program.replace('-', '_').upper()}_COMPLETE" in os.environ:
             # The shell requests completions, which typer handles itself.
             command.main(prog_name=program)
@@ -158,6 +159,22 @@ def say(text: str) -> None:
     if sys.stderr is not None:
         with contextlib.suppress(OSError, ValueError):
             print(text, file=sys.stderr, flush=True)
+
+
+class _Closed(io.TextIOBase):
+    """A standard output that was closed: only a command that needs it fails."""
+
+    def __init__(self) -> None:
+        # Otherwise the next file would get its number, and whatever prints would write into it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+    def write(self, _: str) -> NoReturn:
+        """Raise SinkError."""
+        raise SinkError("standard output: closed; redirect it to a file or /dev/null")
+
+    def fileno(self) -> int:
+        """Raise SinkError."""
+        self.write("")
 
 
 def _drop_stdout() -> None:

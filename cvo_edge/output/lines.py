@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import select
 import stat
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from cvo_edge.errors import SinkError
 from cvo_edge.files import check_output
+from cvo_edge.output.named import Told, has_name, lock, lost, reopenings
 from cvo_edge.vocabulary import Existing
 
-# Set by SIGHUP: every file is opened again before its next line.
-_reopening = 0
 _BLOCK = 4096
-
-
-def reopen_files() -> None:
-    """Have every ``LineFile`` open its name again before its next line.
-
-    A log that was renamed (logrotate) is then followed by a new file.
-    """
-    global _reopening
-    _reopening += 1
 
 
 class LineFile:
@@ -59,36 +47,25 @@ class LineFile:
         self,
         path: str,
         existing: Existing = "replace",
-        told: Callable[[str], None] | None = None,
+        told: Told | None = None,
     ) -> None:
         self._owned = path != "-"
         self._name = path if self._owned else "standard output"
         self._existing, self._told = existing, told
         self._started = False
-        self._opened = _reopening
+        self._opened = reopenings()
         check_output(path, force=existing == "force")
         try:
             self._descriptor = _opened(path) if self._owned else sys.stdout.fileno()
         except OSError as error:
             raise SinkError(f"{self._name}: cannot be written: {error.strerror}") from None
+        if not self._owned:
+            return
         try:
-            self._lock()
+            lock(self._descriptor, self._name)
         except SinkError:
             os.close(self._descriptor)
             raise
-
-    def _lock(self) -> None:
-        """Lock a regular file against a second writer; the lock ends with the process."""
-        if not self._owned or not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
-            return
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise SinkError(
-                f"{self._name}: another run is writing to this file; choose another output"
-            ) from None
-        except OSError:
-            return  # the file system does not support locks
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -155,34 +132,23 @@ class LineFile:
 
     def _open_again(self) -> None:
         """Open the file by its name again if ``reopen_files`` was called."""
-        if not self._owned or self._opened == _reopening:
+        if not self._owned or self._opened == reopenings():
             return
-        asked = _reopening
+        asked = reopenings()
         try:
             descriptor = _opened(self._name)
         except OSError as error:
             raise SinkError(f"{self._name}: cannot be opened again: {error.strerror}") from None
         os.close(self._descriptor)
         self._descriptor = descriptor
-        self._lock()
+        lock(self._descriptor, self._name)
         # Only now, so that a file that cannot be opened or locked yet is tried again.
         self._opened = asked
 
     def _tell_of_a_lost_name(self) -> None:
-        if self._told is not None and not self._has_name():
-            self._told(
-                f"{self._name}: was renamed or removed; records still go to that file. SIGHUP "
-                "opens a new one"
-            )
+        if self._told is not None and not has_name(self._descriptor, self._name):
+            self._told(lost(self._name))
             self._told = None
-
-    def _has_name(self) -> bool:
-        try:
-            named = os.stat(self._name)  # noqa: PTH116 - before every line
-        except OSError:
-            return False
-        found = os.fstat(self._descriptor)
-        return (named.st_dev, named.st_ino) == (found.st_dev, found.st_ino)
 
     def _take_back(self, written: int) -> None:
         """Remove an incomplete line from a regular file."""

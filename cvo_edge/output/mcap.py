@@ -20,6 +20,7 @@ import numpy as np
 from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.output.messages import Message, Placement, StoredImage, ros_image, ros_messages
+from cvo_edge.output.named import Told, has_name, lost, opened_empty, reopenings
 from cvo_edge.output.records import Header, flat
 
 _PROFILE = "ros2"
@@ -68,7 +69,7 @@ class McapFile:
         self.messages = 0
         self._stream: BinaryIO | None = None
         try:
-            self._stream = Path(path).open("wb")  # noqa: SIM115 - closed by __exit__
+            self._stream = opened_empty(path)
             self._writer = library.Writer(self._stream, use_chunking=False)
             self._writer.start(profile=_PROFILE, library="cvo-edge")
             self._stream.flush()
@@ -96,6 +97,11 @@ class McapFile:
                     self._writer.finish()
         except OSError as problem:
             raise self._failed(problem) from None
+
+    @property
+    def named(self) -> bool:
+        """Whether the file is still the one under its name."""
+        return self._stream is not None and has_name(self._stream.fileno(), self._name)
 
     def metadata(self, name: str, content: Mapping[str, str]) -> None:
         """Write keys and values that concern the whole file."""
@@ -205,13 +211,19 @@ class McapSink:
         What all records share; it becomes the file's metadata ``cvo-edge``.
     placement
         Where the estimates are seen from.
+    told
+        Called once if the file loses its name. After SIGHUP, one that has lost it is finished, and
+        another is begun under the name.
     """
 
-    def __init__(self, path: str, header: Header, placement: Placement) -> None:
+    def __init__(
+        self, path: str, header: Header, placement: Placement, told: Told | None = None
+    ) -> None:
         _check_file(path)
         _libraries()
-        self._path, self._header, self._placement = path, header, placement
+        self._path, self._header, self._placement, self._told = path, header, placement, told
         self._file: McapFile | None = None
+        self._opened = reopenings()
 
     def __enter__(self) -> McapSink:
         """Return itself."""
@@ -236,6 +248,7 @@ class McapSink:
         if image is not None:
             messages.append(ros_image(estimate, self._placement, image))
         stamp_ns = estimate.stamp_ns or 0
+        self._follow_its_name()
         if self._file is None:
             # An old file is kept until there is a frame to put in its place.
             self._file = McapFile(self._path)
@@ -243,6 +256,17 @@ class McapSink:
         for message in messages:
             self._file.write(message, stamp_ns, estimate.seq)
         self._file.flush()
+
+    def _follow_its_name(self) -> None:
+        asked, self._opened = self._opened != reopenings(), reopenings()
+        if self._file is None or self._file.named:
+            return
+        if asked:
+            file, self._file = self._file, None
+            file.__exit__(None, None, None)
+        elif self._told is not None:
+            self._told(lost(self._path))
+            self._told = None
 
 
 class Recovered(NamedTuple):

@@ -51,7 +51,7 @@ def open_sink(
         if format == "mcap":
             from cvo_edge.output.mcap import McapSink
 
-            return McapSink(path, header, placement)
+            return McapSink(path, header, placement, told)
         from cvo_edge.output.rerun import RerunSink
 
         return RerunSink(path, header, placement)

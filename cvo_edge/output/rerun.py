@@ -13,7 +13,6 @@ import sys
 import threading
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.output.messages import Placement, StoredImage, spoken
+from cvo_edge.output.named import opened_empty
 from cvo_edge.output.records import Header
 from cvo_edge.record import Status
 
@@ -221,7 +221,7 @@ class _Copy:
     def __init__(self, path: str) -> None:
         self.error: OSError | None = None
         try:
-            self._file = Path(path).open("wb", buffering=0)  # noqa: SIM115 - closed by close
+            self._file = opened_empty(path, buffering=0)
         except OSError as error:
             raise SinkError(f"{path}: cannot be written: {error.strerror}") from None
         self._exit, self._kept = os.pipe()

@@ -239,12 +239,28 @@ def test_closed_or_full_standard_output_is_exit_7(bundle_dir):
             )
         assert result.returncode == 7
         assert len(result.stderr.strip().splitlines()) == 1
-    shell = " ".join(f"'{word}'" for word in [*CVO_EDGE, "inspect", str(bundle_dir)])
-    closed = subprocess.run(
-        ["sh", "-c", shell + " >&-"], capture_output=True, text=True, check=False
-    )
+    closed = without_stdout("inspect", bundle_dir)
     assert closed.returncode == 7
     assert len(closed.stderr.strip().splitlines()) == 1
+
+
+def test_a_closed_standard_output_is_no_fault_of_a_command_that_does_not_use_it(
+    bundle_dir, clip_dir, tmp_path
+):
+    path = tmp_path / "a.jsonl"
+    words = ("run", bundle_dir, clip_dir, "--max-frames", 2, "--quiet", "-o", path)
+    done = without_stdout(*words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(records_in(path.read_text())) == 2
+
+
+def without_stdout(*words):
+    return subprocess.run(
+        ["sh", "-c", 'exec "$@" >&-', "sh", *CVO_EDGE, *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def test_an_output_that_is_an_input_is_refused(bundle_dir, clip_dir):

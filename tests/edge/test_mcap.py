@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.output.messages import Placement, StoredImage
+from cvo_edge.output.named import reopen_files
 from cvo_edge.pose import Pose
 from cvo_edge.record import Status
 
@@ -117,6 +118,37 @@ def test_an_old_file_is_kept_until_there_is_a_frame(tmp_path):
     with McapSink(str(path), HEADER, PLACE) as sink, pytest.raises(UsageError):
         sink.write(unstamped)
     assert path.read_bytes() == b"old"
+
+
+def test_one_file_has_one_writer(tmp_path):
+    path = tmp_path / "a.mcap"
+    with McapSink(str(path), HEADER, PLACE) as sink:
+        sink.write(FRAMES[0])
+        other = McapSink(str(path), HEADER, PLACE)
+        with pytest.raises(SinkError, match="another run is writing to this file"):
+            other.write(FRAMES[0])
+        sink.write(FRAMES[3])
+    assert len(of_topic(path, "/cvo/pose")) == 2
+
+
+def test_a_renamed_file_is_told_once_finished_when_asked_and_followed_by_another(tmp_path):
+    path, rotated, told = tmp_path / "a.mcap", tmp_path / "old.mcap", []
+    with McapSink(str(path), HEADER, PLACE, told.append) as sink:
+        reopen_files()
+        # It still has its name: nothing is to be done.
+        sink.write(FRAMES[0])
+        path.rename(rotated)
+        for seq in (1, 2):
+            sink.write(frame(seq=seq))
+        assert told == [f"{path}: was renamed or removed; records still go to that file. SIGHUP "
+                        "opens a new one"]  # fmt: skip
+        reopen_files()
+        sink.write(FRAMES[3])
+        with AnyReader([rotated]) as reader:
+            assert len([one for one, *_ in reader.messages() if one.topic == "/cvo/pose"]) == 3
+    assert [each.header.stamp.nanosec for each in of_topic(path, "/cvo/pose")] == [
+        FRAMES[3].stamp_ns % 10**9
+    ]
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP", b"no MCAP file at all"])

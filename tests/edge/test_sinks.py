@@ -26,7 +26,8 @@ from cvo_edge import (
     process,
 )
 from cvo_edge.ground_truth import open_ground_truth
-from cvo_edge.output.lines import LineFile, reopen_files
+from cvo_edge.output.lines import LineFile
+from cvo_edge.output.named import reopen_files
 from cvo_edge.output.records import header_of
 from cvo_edge.output.sinks import Sink, format_of
 from cvo_edge.pose import Chart
