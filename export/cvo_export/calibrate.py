@@ -7,10 +7,10 @@ keeps its method and gets thresholds from new data: a new site, another camera, 
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -32,6 +32,7 @@ from cvo_edge.camera import Camera
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import BundleMismatchError, SourceError, UsageError
 from cvo_edge.geometry import mean_rotation
+from cvo_edge.given import given_path
 from cvo_edge.heads import HEADS, Candidate
 from cvo_edge.heads.cqr import CqrParameters
 from cvo_edge.pose import about
@@ -73,9 +74,9 @@ _PACKAGES = ("cvo-edge", "cvo-export", "onnx", "onnxruntime", "numpy")
 
 
 def calibrate(
-    model: Path,
+    model: str | os.PathLike[str],
     dataset: PoseDataset,
-    bundle_dir: Path,
+    bundle_dir: str | os.PathLike[str],
     name: str,
     *,
     kind: SplitKind | None = None,
@@ -122,6 +123,8 @@ def calibrate(
     SinkError
         The new folder cannot be written.
     """
+    model = given_path(model, "model")
+    bundle_dir = given_path(bundle_dir, "bundle")
     check_target(bundle_dir)
     size = one_size(dataset)
     if model.is_dir():

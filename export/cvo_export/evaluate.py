@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, get_args
 
 import msgspec
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cvo_edge.bundle.format import Calibration, LeftOut, StillDof
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.errors import GateError, UsageError
+from cvo_edge.given import given_path
 from cvo_edge.guarantee import by_level, left_out_text
 from cvo_edge.heads import HEADS
 from cvo_edge.odometer import Odometer
@@ -48,7 +49,7 @@ _CROSSED = (
 
 
 def evaluate(
-    bundle_dir: Path,
+    bundle_dir: str | os.PathLike[str],
     dataset: PoseDataset,
     subset: Subset,
     threads: int | None = None,
@@ -78,6 +79,7 @@ def evaluate(
     UsageError
         Noise with the subset ``all``; a schedule with ``noise``; ``then`` without a schedule.
     """
+    bundle_dir = given_path(bundle_dir, "bundle")
     if (schedule is None and then is not None) or (schedule is not None and noise is not None):
         raise UsageError(
             "then: expected --online every=K,delay=D with --then NOISE and without --noise"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, cast
 
 import msgspec
@@ -16,6 +16,7 @@ from torch import nn
 from cvo_edge.bundle.format import Calibration, PoseSpec, PreprocessSpec, Provenance
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import GateError
+from cvo_edge.given import given_path
 from cvo_edge.input import preprocess
 from cvo_edge.input.frame_checks import SAMPLE_STEP
 from cvo_edge.vocabulary import Joint, Precision, Provider, Rule, Sides
@@ -58,7 +59,7 @@ _STILL_MARGIN = 10.0
 
 def publish(
     run: Run,
-    bundle_dir: Path,
+    bundle_dir: str | os.PathLike[str],
     name: str,
     *,
     rule: Rule | None = None,
@@ -89,6 +90,7 @@ def publish(
     ModelError
         The provider is not installed, or cannot run the graph.
     """
+    bundle_dir = given_path(bundle_dir, "bundle")
     check_target(bundle_dir)
     one_size(run.dataset)
     run = replace(run, dataset=remembered(run.dataset))

@@ -51,6 +51,8 @@ def open_dataset(text: str) -> PoseDataset:
     SourceError
         The data set cannot be read or has no frame with a pose.
     """
+    if not isinstance(text, str):
+        raise UsageError(f"data set: expected the text FORMAT:PATH, found {text!r}")
     name, colon, path = text.partition(":")
     if not colon or name not in FORMATS:
         raise UsageError(

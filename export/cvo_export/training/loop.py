@@ -8,6 +8,7 @@ checkpoint: a resumed run ends with the same numbers as an uninterrupted one.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from cvo_edge.camera import Camera
 from cvo_edge.errors import UsageError
+from cvo_edge.given import given_path
 from cvo_export.data.place import Place
 from cvo_export.data.sparse_map import SparseMap, read_sparse_map, sparse_map, write_sparse_map
 from cvo_export.data.splits import (
@@ -66,7 +68,12 @@ MAP_FILE = "map.npz"
 _LEAST_VAL = 9
 
 
-def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | None = None) -> Run:
+def train(
+    run_dir: str | os.PathLike[str],
+    config: TrainConfig,
+    progress: Progress,
+    cache: str | os.PathLike[str] | None = None,
+) -> Run:
     """Train, or resume an interrupted run of the same configuration.
 
     Features of the pretrained network are stored in the run's folder, or in a folder of ``cache``
@@ -75,6 +82,8 @@ def train(run_dir: Path, config: TrainConfig, progress: Progress, cache: Path | 
     Raises UsageError if ``run_dir`` holds another configuration, if val has too few frames to
     select a network, or if the run cannot be crossed.
     """
+    run_dir = given_path(run_dir, "run folder")
+    cache = None if cache is None else given_path(cache, "cache")
     dataset, split = open_run(run_dir, config)
     _check_val(config, split)
     _check_crossed(config, dataset, split)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 
 from cvo_edge.errors import SinkError, UsageError
 from cvo_edge.files import whole_file, write_whole
+from cvo_edge.given import given_path
 from cvo_edge.vocabulary import Crop, SplitKind
 from cvo_export.bundles.draft import still_text
 from cvo_export.data.augment import AugmentConfig
@@ -285,12 +287,13 @@ def _encoded(config: TrainConfig) -> bytes:
     return msgspec.json.format(msgspec.json.encode(config), indent=1)
 
 
-def load_run(run_dir: Path, dataset: str | None = None) -> Run:
+def load_run(run_dir: str | os.PathLike[str], dataset: str | None = None) -> Run:
     """Read a finished run; ``dataset`` is the new location of its data set, if it has moved.
 
     Raises UsageError if the folder holds no finished run, SourceError if the data set is not the
     one that was split.
     """
+    run_dir = given_path(run_dir, "run folder")
     path = run_dir / NETWORK_FILE
     if not path.is_file():
         raise UsageError(f"{run_dir}: expected a finished run, found no {NETWORK_FILE}")
