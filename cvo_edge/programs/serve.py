@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import faulthandler
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
@@ -130,6 +132,9 @@ def serve(
         service.sinks.append(Dropping(what, opening, say))
         return service.sinks[-1]
 
+    if sys.stderr is not None:
+        # A watchdog's SIGABRT then says where each thread was.
+        faulthandler.enable(sys.stderr)
     with opened(wanted, patience=waiting, around=around, counts=service.counts) as job:
         check_selftest(job.odometer)
         try:
