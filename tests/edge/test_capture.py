@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from cvo_edge import SourceError, UsageError, open_source
+from cvo_edge.input import capture as capture_module
 from cvo_edge.input.capture import READER, Capture, Grabbed, shown
 from cvo_edge.input.clock import Clock
 from cvo_edge.input.sources import PAUSES_S, Camera
@@ -196,6 +197,52 @@ def test_time_in_which_the_process_was_stopped_is_not_waited_time():
         capture.read()
     assert sum(never.waits_s) == pytest.approx(5.0)
     with pytest.raises(SourceError, match="closed"):
+        capture.read()
+
+
+class SlowVideo:
+    """Stands for OpenCV's capture; its frame comes when ``due`` is set."""
+
+    def __init__(self):
+        self.asked, self.due, self.released = threading.Event(), threading.Event(), False
+
+    def __getattr__(self, name):
+        return lambda *_: 0.0
+
+    def open(self, *_):
+        return True
+
+    def getBackendName(self):  # noqa: N802 - OpenCV's name
+        return "FFMPEG"
+
+    def grab(self):
+        self.asked.set()
+        return self.due.wait(HANGS_S) and False
+
+    def release(self):
+        self.released = True
+
+
+def test_a_read_that_is_under_way_ends_before_python_does(monkeypatch):
+    """Python would end its thread inside OpenCV, and abort."""
+    video = SlowVideo()
+    capture = Capture("slow", HANGS_S, video=lambda: video)
+    capture.open()
+    reading = threading.Thread(target=read_quietly, args=(capture,))
+    reading.start()
+    video.asked.wait(HANGS_S)
+    capture.close()
+    assert not video.released
+    monkeypatch.setattr(capture_module, "_RELEASE_S", HANGS_S)
+    monkeypatch.setattr(capture_module, "_reading", {capture._thread})
+    video.due.set()
+    capture_module._await_readers()
+    assert video.released
+    reading.join(HANGS_S)
+
+
+def read_quietly(capture):
+    with contextlib.suppress(SourceError):
         capture.read()
 
 
