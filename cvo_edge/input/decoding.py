@@ -10,10 +10,14 @@ import math
 import re
 import struct
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from cvo_edge.errors import UsageError
+from cvo_edge.given import given_count
 
 # 192 MiB as BGR, and several times that while some formats are decoded; 8K cameras have half of it.
 MAX_PIXELS = 1 << 26
@@ -42,11 +46,24 @@ _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_TILE, _TIFF_ORIENTATION = 256, 257, (322, 323),
 _TIFF_NUMBERS = {3: "H", 4: "I"}
 
 
-def decode_image(content: bytes) -> NDArray[np.uint8] | None:
+def upper_eight(values: NDArray[Any], bits: int = 16) -> NDArray[np.uint8]:
+    """Return the upper eight of ``bits`` bits, uint16; larger values are white."""
+    return np.asarray(np.minimum(values >> (bits - 8), 255), np.uint8)
+
+
+def checked_bits(bits: object) -> int:
+    """Return how many bits of 16 a camera fills; raises UsageError."""
+    count = given_count(bits, "bit depth")
+    if not 9 <= count <= 16:
+        raise UsageError(f"bit depth: expected 9 to 16 bits, found {count}")
+    return count
+
+
+def decode_image(content: bytes, bits: int = 16) -> NDArray[np.uint8] | None:
     """Decode an image file to (height, width, 3) uint8 BGR; None if it is damaged or unsupported.
 
     JPEG, PNG, BMP, PNM, TIFF and WebP are recognised by their first bytes. Grey is repeated, alpha
-    dropped, 16 bits keep their upper eight, and pixels keep the order in which they are stored, the
+    dropped, 16 bits keep the upper eight of ``bits``, and pixels keep their stored order, the
     sensor's (no rotation by EXIF or TIFF's tag 274). The result is None for other formats, for a
     header that contradicts itself or asks for more than ``MAX_PIXELS``, and for an incomplete file:
     some OpenCV versions decode a cut JPEG to a wrong picture of full size, so its end marker is
@@ -65,7 +82,7 @@ def decode_image(content: bytes) -> NDArray[np.uint8] | None:
     if image is None or image.shape[:2] != size:
         return None
     if image.dtype == np.uint16:
-        image = np.right_shift(image, 8, dtype=np.uint16).astype(np.uint8)
+        image = upper_eight(image, bits)
     return np.asarray(image, np.uint8) if image.dtype == np.uint8 else None
 
 

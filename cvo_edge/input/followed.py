@@ -77,7 +77,9 @@ class FollowedFolder:
         live: bool = False,
         clock: Clock = SYSTEM_CLOCK,
         patience: Patience | None = None,
+        bits: int = 16,
     ) -> None:
+        self._bits = bits
         self.live, self.left_out = live, Counter[str]()
         self._folder, self._fps, self._quiet_s, self._clock = folder, fps, quiet_s, clock
         self._stopped = Event()
@@ -180,10 +182,10 @@ class FollowedFolder:
             now_s, before = self._clock.now_s(), state
             state = _state(path)
             if state is None:
-                return read_image_file(path, None)  # it has vanished, or leads nowhere
+                return read_image_file(path, None, self._bits)  # it has vanished, or leads nowhere
             age_s = max(1e-9 * (self._clock.time_ns() - state[1]), 0.0)
             if frame is None or state != before:
-                since_s, frame = now_s, read_image_file(path, None)
+                since_s, frame = now_s, read_image_file(path, None, self._bits)
             unchanged_s = max(now_s - since_s, age_s if before in (None, state) else 0.0)
             whole = frame.image is not None and (ends or unchanged_s >= _STEADY_S)
             if whole or unchanged_s >= _GIVEN_UP_S:

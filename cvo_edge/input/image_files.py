@@ -61,8 +61,14 @@ class ImageFiles:
     live = False
 
     def __init__(
-        self, listing: Listing, fps: float | None, if_empty: str, stamps: str | None = None
+        self,
+        listing: Listing,
+        fps: float | None,
+        if_empty: str,
+        stamps: str | None = None,
+        bits: int = 16,
     ) -> None:
+        self._bits = bits
         self._folder, self._names, self.left_out = listing
         if not self._names:
             reasons = f"; left out {left_out_text(self.left_out)}" if self.left_out else ""
@@ -81,7 +87,8 @@ class ImageFiles:
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield one call a file."""
         for name, stamp_ns in zip(self._names, self._stamps_ns, strict=False):
-            yield partial(read_image_file, os.path.join(self._folder, name), stamp_ns)  # noqa: PTH118
+            path = os.path.join(self._folder, name)  # noqa: PTH118
+            yield partial(read_image_file, path, stamp_ns, self._bits)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield one frame a file."""
@@ -89,12 +96,12 @@ class ImageFiles:
             yield read()
 
 
-def read_image_file(path: str, stamp_ns: int | None) -> Frame:
+def read_image_file(path: str, stamp_ns: int | None, bits: int = 16) -> Frame:
     """Read and decode one image file; a frame without an image if that fails."""
     start = perf_counter()
     try:
         content = read_regular_file(Path(path), MAX_IMAGE_BYTES, SourceError, links=True)
-        image = decode_image(content)
+        image = decode_image(content, bits)
     except SourceError:
         image = None
     spent = 1e3 * (perf_counter() - start)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.camera import Distortion
-from cvo_edge.input.decoding import MAX_PIXELS, decode_image, image_size
+from cvo_edge.input.decoding import MAX_PIXELS, decode_image, image_size, upper_eight
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -78,23 +78,23 @@ def message_size(message: Any) -> tuple[int, int] | None:
     return (height, width) if whole else None
 
 
-def message_image(message: Any) -> Image | None:
+def message_image(message: Any, bits: int = 16) -> Image | None:
     """Return the image in a message, (height, width, 3) BGR; None if it cannot be decoded.
 
-    16 bits keep their upper eight, as in ``decode_image``.
+    16 bits keep the upper eight of ``bits``, as in ``decode_image``.
     """
     size = message_size(message)
     if size is None:
         return None
     content = np.frombuffer(message.data, np.uint8)
     if not hasattr(message, "encoding"):
-        return decode_image(content.tobytes())
+        return decode_image(content.tobytes(), bits)
     form, (height, width) = FORMS[message.encoding], size
     rows = content[: message.step * height].reshape(height, message.step)
     pixels = np.ascontiguousarray(rows[:, : width * form.channels * form.depth])
     if form.depth == 2:
         wide = pixels.view(">u2" if message.is_bigendian else "<u2")
-        pixels = (wide >> 8).astype(np.uint8)
+        pixels = upper_eight(wide, bits)
     if form.channels > 1:
         pixels = pixels.reshape(height, width, form.channels)
     if form.conversion is None:

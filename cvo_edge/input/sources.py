@@ -16,6 +16,7 @@ from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.given import given_number, given_source
 from cvo_edge.input.capture import OPENING, TIMEOUT_S, Capture, Reader, shown
 from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
+from cvo_edge.input.decoding import checked_bits
 from cvo_edge.input.followed import FollowedFolder
 from cvo_edge.input.frame import Frame, Source
 from cvo_edge.input.image_files import (
@@ -50,6 +51,7 @@ def open_source(
     *,
     live: bool = False,
     follow: bool = False,
+    bit_depth: int = 16,
 ) -> Source:
     """Open a folder of images, a glob, a video file, a pipe, a camera or a stream.
 
@@ -79,6 +81,8 @@ def open_source(
         that is followed then grow old, too.
     follow
         Whether to wait for new images in a folder, see ``FollowedFolder``.
+    bit_depth
+        Bits that the camera fills in files of 16 bits, from 9; the upper eight of them are used.
 
     Raises
     ------
@@ -90,6 +94,7 @@ def open_source(
         folder.
     """
     text = without_stdin(given_source(source))
+    bits = checked_bits(bit_depth)
     # What is waited for is a camera.
     live = live or patience is not None
     fps = None if fps is None else given_number(fps, "fps")
@@ -108,10 +113,10 @@ def open_source(
         raise SourceError(f"{shown(text)}: not a usable name: {error.strerror}") from None
     if follow:
         _check_followed(path, stamps)
-        return FollowedFolder(path, fps, quiet_s, live=live, patience=patience)
+        return FollowedFolder(path, fps, quiet_s, live=live, patience=patience, bits=bits)
     if path.is_dir():
         return ImageFiles(
-            images_in(path), fps, f"{shown(text)}: expected images, found none", stamps
+            images_in(path), fps, f"{shown(text)}: expected images, found none", stamps, bits
         )
     if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
         raise SourceError(f"{shown(text)}: expected a file's path, found a file address")
@@ -128,12 +133,16 @@ def open_source(
         return Camera(device, fps, timeout_s, reader=reader, patience=patience)
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES or is_one_image(path):
-            return ImageFiles(Listing("", [text], {}), fps, "", stamps)
+            return ImageFiles(Listing("", [text], {}), fps, "", stamps, bits)
         return Video(path, fps, timeout_s, _listed(stamps), threads)
     if glob.has_magic(text):
         found = [name for name in glob.iglob(text, recursive=True) if not os.path.isdir(name)]  # noqa: PTH112
         return ImageFiles(
-            colour_images(found), fps, f"{shown(text)}: expected images, found no match", stamps
+            colour_images(found),
+            fps,
+            f"{shown(text)}: expected images, found no match",
+            stamps,
+            bits,
         )
     raise SourceError(
         f"{shown(text)}: not found; expected a folder, glob, video file, camera index, device or "

@@ -64,6 +64,7 @@ class Wanted:
     follow: bool = False
     adapt: bool = False
     view: bool = False
+    bit_depth: int = 16
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ def opened(
         wanted.threads,
         live=wanted.mode == "live",
         follow=wanted.follow,
+        bit_depth=wanted.bit_depth,
     )
     with (
         Odometer.load(

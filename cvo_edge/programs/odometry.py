@@ -23,7 +23,6 @@ from cvo_edge.programs.options import (
     OutputOption,
     StampsOption,
     TimeoutOption,
-    examples,
     existing_file,
 )
 from cvo_edge.vocabulary import MotionRule, Scope
@@ -38,10 +37,6 @@ if TYPE_CHECKING:
 _NEAR_NS = 20_000_000
 
 StepFormat = Literal["jsonl", "tum"]
-_EXAMPLES = examples(
-    "cvo-edge odometry frames/ --camera camera.json --fps 30 -o steps.tum",
-    "cvo-edge odometry 0 --camera 640x480,585,585,320,240",
-)
 
 
 def odometry(

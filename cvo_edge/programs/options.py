@@ -104,6 +104,16 @@ StampsOption = Annotated[
         rich_help_panel="Input",
     ),
 ]
+BitDepthOption = Annotated[
+    int,
+    typer.Option(
+        "--bit-depth",
+        min=9,
+        max=16,
+        help="Bits that the camera fills in image files of 16 bits, e.g. 12.",
+        rich_help_panel="Input",
+    ),
+]
 ExpectMotionOption = Annotated[
     bool,
     typer.Option(

@@ -19,6 +19,7 @@ from cvo_edge.programs.convert import (
 from cvo_edge.programs.options import (
     REPORT,
     AppendOption,
+    BitDepthOption,
     BundleArgument,
     CacheOption,
     CameraOption,
@@ -72,6 +73,7 @@ def run(
     ] = None,
     stamps: StampsOption = None,
     camera: CameraOption = None,
+    bit_depth: BitDepthOption = 16,
     expect_motion: ExpectMotionOption = False,
     max_frames: MaxFramesOption = None,
     follow: FollowOption = False,
@@ -143,6 +145,7 @@ def run(
         mavlink=mavlink,
         metrics=metrics,
         view=view,
+        bit_depth=bit_depth,
         placing=(base, map, frame_id, child_frame_id, unknown_variance),
     )
     read = (source, bundle, public_key, camera, state, stamps)

@@ -15,7 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cvo_edge.errors import UsageError
 from cvo_edge.input.decoding import MAX_PIXELS, decode_image, image_size
+from cvo_edge.input.sources import open_source
 
 SUFFIXES = (".jpg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".webp")
 
@@ -114,6 +116,20 @@ def test_a_header_that_asks_for_too_much_is_refused(suffix, place, form):
 def test_16_bits_keep_their_upper_eight(suffix):
     wide = np.random.default_rng(1).integers(0, 65536, (48, 64, 3)).astype(np.uint16)
     np.testing.assert_array_equal(decode_image(encoded(suffix, wide)), (wide >> 8).astype(np.uint8))
+
+
+@pytest.mark.parametrize("bits", [9, 10, 12, 16])
+def test_a_camera_of_fewer_bits_keeps_the_upper_eight_of_them(bits, tmp_path):
+    image = picture()
+    wide = image.astype(np.uint16) << (bits - 8)
+    path = tmp_path / "1.png"
+    path.write_bytes(encoded(".png", wide))
+    for source in (tmp_path, path, tmp_path / "*.png"):
+        (frame,) = open_source(source, bit_depth=bits)
+        np.testing.assert_array_equal(frame.image, image)
+    assert decode_image(encoded(".png", wide + 256), 9).max() == 255
+    with pytest.raises(UsageError, match="bit depth: expected 9 to 16 bits, found 8"):
+        open_source(path, bit_depth=8)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])

@@ -104,6 +104,17 @@ def test_a_damaged_image_names_its_file(tmp_path):
         found.read_image(1)
 
 
+def test_images_of_fewer_bits_keep_the_upper_eight_of_them(tmp_path):
+    scene(tmp_path, sequences=1, frames=2, suffix=".color.png")
+    plain = open_dataset(f"7scenes:{tmp_path}").read_image(0)
+    for path in tmp_path.rglob("*.color.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path)).astype(np.uint16) << 4)
+    np.testing.assert_array_equal(open_dataset(f"7scenes:{tmp_path},bits=12").read_image(0), plain)
+    assert open_dataset(f"7scenes:{tmp_path}").read_image(0).max() < 16
+    with pytest.raises(UsageError, match="bit depth: expected 9 to 16 bits, found 8"):
+        open_dataset(f"7scenes:{tmp_path},bits=8")
+
+
 def test_writing_a_sequence_gives_it_back(tmp_path):
     rendered = open_dataset("synthetic:room,flights=1,frames=3,size=64x48")
     assert write_sequence(rendered, 0, tmp_path / "clip", 2) == 2

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.input.decoding import checked_bits
 from cvo_export.datasets.ace import open_ace
 from cvo_export.datasets.base import Intrinsics, Lens, PoseDataset
 from cvo_export.datasets.colmap import open_colmap
 from cvo_export.datasets.euroc import open_euroc
+from cvo_export.datasets.frames import BITS
 from cvo_export.datasets.kitti import open_kitti
 from cvo_export.datasets.rgbd_scenes import open_rgbd_scenes
 from cvo_export.datasets.rosbag import open_rosbag
@@ -42,7 +44,8 @@ FORMATS: dict[str, Callable[[str], PoseDataset]] = {
 def open_dataset(text: str) -> PoseDataset:
     """Open ``FORMAT:PATH``, e.g. ``7scenes:scenes/redkitchen`` or ``synthetic:room``.
 
-    The module of each format documents its paths and poses.
+    The module of each format documents its paths and poses. ``,bits=12`` at the end says how many
+    bits the camera fills in images of 16 bits; the upper eight of them are used.
 
     Raises
     ------
@@ -53,14 +56,20 @@ def open_dataset(text: str) -> PoseDataset:
     """
     if not isinstance(text, str):
         raise UsageError(f"data set: expected the text FORMAT:PATH, found {text!r}")
-    name, colon, path = text.partition(":")
+    plain, option, digits = text.rpartition(",bits=")
+    stated = bool(option) and digits.isdecimal()
+    bits = checked_bits(int(digits)) if stated else 16
+    name, colon, path = (plain if stated else text).partition(":")
     if not colon or name not in FORMATS:
         raise UsageError(
             f"data set: expected FORMAT:PATH with FORMAT one of {', '.join(FORMATS)}, "
             f"found {text!r}"
         )
+    token = BITS.set(bits)
     try:
         return FORMATS[name](path)
     except OSError as error:
         where = error.filename or path
         raise SourceError(f"{where}: expected a data set; cannot read: {error.strerror}") from None
+    finally:
+        BITS.reset(token)

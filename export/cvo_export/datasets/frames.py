@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
 
@@ -131,13 +132,18 @@ class FrameList:
         )
 
 
+# Bits that the camera fills in images of 16 bits, while a data set is opened.
+BITS: ContextVar[int] = ContextVar("bits", default=16)
+
+
 def image_reader(paths: Sequence[Path]) -> Callable[[int], NDArray[np.uint8]]:
     """Return a ``read_image`` for image files; colour and grey images are read as BGR."""
+    bits = BITS.get()
 
     def read_image(index: int) -> NDArray[np.uint8]:
         path = paths[index]
         try:
-            image = decode_image(path.read_bytes())
+            image = decode_image(path.read_bytes(), bits)
         except OSError as error:
             raise SourceError(
                 f"{path}: expected an image; the file cannot be read: {error.strerror}"

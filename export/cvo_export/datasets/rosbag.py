@@ -31,18 +31,20 @@ from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS
 from cvo_export.datasets.bag_cameras import bag_camera
 from cvo_export.datasets.base import PoseDataset, skipped_text
 from cvo_export.datasets.folders import only_camera
+from cvo_export.datasets.frames import BITS
 
 Array = NDArray[np.float64]
 
 
 class _Image(NamedTuple):
-    """Where an image is: its bag, topic, and time and number of receipt; height and width."""
+    """Where an image is: its bag, topic, and time and number of receipt; height and width; bits."""
 
     bag: Bag
     topic: str
     received_ns: int
     number: int
     size: tuple[int, int]
+    bits: int
 
 
 def open_rosbag(path: str) -> PoseDataset:
@@ -124,14 +126,15 @@ def _index(bag: Bag, topic: str, skipped: Skipped) -> tuple[list[_Image], Stamps
             skipped.add("unreadable image")
             continue
         frame = frame or frame_name(message.content.header.frame_id)
-        place = _Image(bag, topic, message.received_ns, message.number, size)
+        place = _Image(bag, topic, message.received_ns, message.number, size, BITS.get())
         rows.append((message.stamp_ns, place))
     rows.sort(key=lambda row: row[0])
     return [image for _, image in rows], np.array([stamp for stamp, _ in rows]), frame
 
 
 def _read(image: _Image) -> NDArray[np.uint8]:
-    found = message_image(image.bag.message(image.topic, image.received_ns, image.number))
+    message = image.bag.message(image.topic, image.received_ns, image.number)
+    found = message_image(message, image.bits)
     if found is None:
         raise SourceError(
             f"{image.bag.path}: expected an image in {image.topic} at {image.received_ns} ns, "
