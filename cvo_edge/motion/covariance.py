@@ -189,7 +189,8 @@ def fit_factors(recordings: Sequence[Sequence[Sums]], groups: Sequence[str]) -> 
         for over in zip(*recordings, strict=True):
             ratios = np.mean([_variance_ratio(sums, factors) for sums in over], axis=0)
             growth += np.log(np.maximum(ratios, 1e-12)) / len(recordings[0])
-        factors = factors * np.exp(_STEP * growth)
+        # A degree of freedom that never errs would shrink beyond what numbers hold.
+        factors = np.maximum(factors * np.exp(_STEP * growth), _LEAST)
     scores = [
         np.concatenate([nees(sums.residuals, sums.covariance(factors)) for sums in each])
         for each in recordings

@@ -32,7 +32,8 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _MEMORY_S = 5.0
-_LEAST = 1e-6
+# Of a logarithm: 1 %, and more than means in a file are rounded by.
+_LEAST = 1e-2
 # Of a second, for estimators whose stamps jitter.
 _NEARLY = 0.8
 

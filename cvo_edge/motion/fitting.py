@@ -31,6 +31,8 @@ _CLIP = 6.0
 _LEAST = 0.2
 # Numbers are clipped at so many standard deviations: no extrapolation.
 _RANGE = 3.0
+# Numbers that vary less, such as the height of a planar robot, are noise of rounding.
+_ROUNDING = 1e-7
 # Of any scale in a file, whoever wrote it.
 _LARGEST_LOG = 20.0
 
@@ -131,7 +133,7 @@ def eight(errors: Array) -> Array:
 
 def _ridge(left: Array, right: Array, strength: float) -> Array:
     """Solve for coefficients; each column of A is penalised in units of its own variance."""
-    _, variance = _moments(left)
+    variance = np.maximum(_moments(left)[1], _ROUNDING**2)
     penalty = strength * left[0, 0] * variance + 1e-9 * np.diag(left) + 1e-300
     penalty[0] = 0.0
     return np.asarray(np.linalg.solve(left + np.diag(penalty), right))

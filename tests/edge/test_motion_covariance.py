@@ -11,7 +11,9 @@ from cvo_edge.motion.covariance import (
     CHI_SQUARE,
     LEVEL,
     Shape,
+    Sums,
     adjoint,
+    fit_factors,
     fit_shape,
     in_fixed_axes,
     nees,
@@ -102,3 +104,16 @@ def test_filters_can_factorise_the_covariance_of_a_planar_robot() -> None:
     (covariance,) = in_fixed_axes(shape.covariance(scales, np.zeros((1, 6))), turn)
     np.linalg.cholesky(covariance)
     assert np.sqrt(np.linalg.eigvalsh(covariance)[0]) > 0.5e-7
+
+
+def test_factors_of_a_degree_of_freedom_that_never_errs_are_numbers() -> None:
+    generator = np.random.default_rng(4)
+    moves = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    parts = np.einsum("di,dj->dij", np.eye(6), np.eye(6))
+    sums = [
+        Sums(np.tile(count * parts, (50, 1, 1, 1)), moves * generator.normal(size=(50, 6)))
+        for count in (10, 20, 50, 100)
+    ]
+    factors = fit_factors([sums, sums], ["a", "b"])
+    assert (factors[:3] > 1e-4).all()
+    assert (factors < 10.0).all()

@@ -494,6 +494,25 @@ def test_a_planar_robot_that_stands_at_times_is_calibrated() -> None:
     assert all(np.isfinite(each.nees) for one in report.recordings for each in one.horizons)
 
 
+def test_an_estimator_that_turns_evenly_and_without_errors_is_calibrated() -> None:
+    """Numbers that vary by rounding alone are no reason for a bias, a scale or a doubt."""
+    generator, time = np.random.default_rng(1), 0.1 * np.arange(200.0)
+    pairs = []
+    for number in range(2):
+        turn = np.stack([np.sin(0.1 * time), np.cos(0.1 * time)], axis=1)
+        true = np.stack([time, 0.1 * number * time, 0.0 * time], axis=1)
+        true = np.concatenate([true + np.sin(time)[:, np.newaxis], 0.0 * turn, turn], axis=1)
+        estimate = true + np.pad(0.01 * generator.normal(size=(200, 3)), ((0, 0), (0, 4)))
+        stamps = np.round(1e9 * time).astype(np.int64)
+        name = f"even-{number}"
+        pairs.append(Pair(name, name, stamps, estimate, {}, Track(stamps, true)))
+    file = conformalize(Here(pairs), "even", HORIZONS, [])
+    calibration = MotionCalibration(decode_motion_file(encode_motion_file(file)))
+    given = pairs[0].stamps_ns, pairs[0].estimate, {}
+    records = list(annotate(calibration, calibration.level(), *given, covariance="integrated"))
+    assert all(record.status == "ok" and record.covariance for record in records[1:])
+
+
 def test_a_column_that_is_no_number_is_a_pose_that_is_missing(tmp_path: Path) -> None:
     pairs = [drive(210 + seed, 200) for seed in range(3)]
     for pair in pairs:
