@@ -22,8 +22,8 @@ from typer.main import get_command
 from cvo_edge.errors import CvoError, SinkError, SourceError, printable
 from cvo_edge.output.named import reopen_files
 
-# How long regular cleanup after a signal may take.
-_PATIENCE_S = 0.8
+# How long regular cleanup after a signal may take, s.
+_patience_s = 0.8
 # Signals that end a process silently by default, and mean nothing to this program.
 _MEANINGLESS = frozenset(
     (
@@ -263,13 +263,19 @@ def end_within_a_second() -> None:
             # A command may give a signal a meaning of its own.
             unasked = number in _MEANINGLESS and signal.getsignal(number) is _terminate
             if unasked or number in (signal.SIGINT, signal.SIGTERM):
-                time.sleep(_PATIENCE_S)
+                time.sleep(_patience_s)
                 if unasked:
                     say(_ended_by(number))
                 os._exit(128 + number)
 
     with contextlib.suppress(RuntimeError):  # no thread: only Python's own handlers
         threading.Thread(target=watch, name="cvo-edge signals", daemon=True).start()
+
+
+def clean_up_within(seconds: float) -> None:
+    """Grant more time after a signal, to a program that has more to finish."""
+    global _patience_s
+    _patience_s = seconds
 
 
 def keep_libraries_off_stderr() -> None:

@@ -14,7 +14,7 @@ import typer
 
 from cvo_edge.errors import UsageError
 from cvo_edge.files import check_output
-from cvo_edge.process import Terminated, say
+from cvo_edge.process import Terminated, clean_up_within, say
 from cvo_edge.programs.convert import (
     BaseOption,
     ChildFrameIdOption,
@@ -51,6 +51,9 @@ if TYPE_CHECKING:
     from cvo_edge.programs.job import Opening
     from cvo_edge.programs.notify import Notifier
     from cvo_edge.programs.service import Service
+
+# To finish the frames that were given, and to account for them, also on a busy machine.
+_PATIENCE_S = 4.0
 
 
 def serve(
@@ -161,6 +164,7 @@ def _signals(frames: Source, service: Service, notifier: Notifier) -> Iterator[N
     files again, by the handler that is there, and systemd is told. SIGUSR1 asks for the health
     line.
     """
+    clean_up_within(_PATIENCE_S)
     reopening = signal.getsignal(signal.SIGHUP)
 
     def end(*_: object) -> None:
