@@ -14,6 +14,7 @@ def main() -> NoReturn:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from cvo_edge import process
 
+    process.check_memory("cvo-edge")
     process.prepare_environment()
     from cvo_edge.programs.cli import main as run
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import resource
 import signal
 import sys
 import threading
@@ -22,6 +23,10 @@ from typer.main import get_command
 from cvo_edge.errors import CvoError, SinkError, SourceError, printable
 from cvo_edge.output.named import reopen_files
 
+# With less address space than this, numpy, OpenCV and onnxruntime cannot be loaded and run.
+_LEAST_MEMORY = 512 << 20
+# How the loader, C++ and torch say that memory is missing.
+_NO_MEMORY = ("failed to map segment", "annot allocate memory", "an't allocate memory", "bad_alloc")
 # How long regular cleanup after a signal may take, s.
 _patience_s = 0.8
 # Signals that end a process silently by default, and mean nothing to this program.
@@ -34,6 +39,20 @@ _MEANINGLESS = frozenset(
 )
 # Names of the threads that may be blocked in a read when the program exits.
 _LEFT_BEHIND = ("cvo-edge reader", "cvo-edge worker")
+
+
+def check_memory(program: str) -> None:
+    """Exit with one line if a limit of the address space (``ulimit -v``) leaves too little.
+
+    Below it, libraries end the process themselves, without a word: OpenBLAS, for example.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:
+        message = (
+            f"not enough memory: expected an address space of at least {_LEAST_MEMORY >> 20} MiB, "
+            f"found a limit of {limit >> 20} MiB (ulimit -v)"
+        )
+        sys.exit(_complain(program, message, 1))
 
 
 def prepare_environment() -> None:
@@ -108,6 +127,8 @@ def guarded(program: str, app: typer.Typer) -> NoReturn:
     except MemoryError:
         code = _complain(program, "not enough memory for this command", 1)
     except Exception as error:
+        if any(text in str(error) for text in _NO_MEMORY):
+            _leave(_complain(program, "not enough memory for a library (ulimit -v)", 1))
         if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
             _leave(_complain(program, "this machine cannot start more threads", 1))
         # A C extension that is being imported replaces the exception that a signal raises.

@@ -324,6 +324,35 @@ def test_bench_of_a_source_without_frames_ends(bundle_dir, tmp_path):
     refused(cvo_edge("bench", bundle_dir, path), 6)
 
 
+def test_too_little_address_space_is_one_line(bundle_dir, clip_dir):
+    """Below a limit, libraries fail to load or end the process without a word."""
+    limit = 200 << 20
+    result = cvo_edge(
+        "run",
+        bundle_dir,
+        clip_dir,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+    )
+    assert "expected an address space of at least 512 MiB, found a limit of 200" in refused(
+        result, 1
+    )
+
+
+@pytest.mark.parametrize(
+    "error", ["ImportError('x.so: failed to map segment')", "RuntimeError('std::bad_alloc')"]
+)
+def test_a_library_without_memory_is_one_line(error):
+    code = (
+        "import typer; from cvo_edge.process import guarded; app = typer.Typer()\n"
+        f"@app.command()\ndef work(): raise {error}\n"
+        "guarded('cvo-edge', app)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--"], capture_output=True, text=True, check=False
+    )
+    assert "not enough memory for a library" in refused(done, 1)
+
+
 def test_exit_2_for_what_cannot_be_asked(bundle_dir, clip_dir):
     assert "0.5, 0.8, 0.9, 0.95, 0.99" in refused(
         cvo_edge("run", bundle_dir, clip_dir, "--confidence", 0.42), 2

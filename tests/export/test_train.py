@@ -115,6 +115,28 @@ def test_a_run_of_another_release_is_refused(tiny_run, run_dir, tmp_path):
         load_run(folder)
 
 
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda stored: torch.zeros(3),
+        lambda stored: None,
+        lambda stored: [1, 2],
+        lambda stored: stored["backbone"],
+        lambda stored: {key: stored[key] for key in stored if key != "target"},
+        lambda stored: {**stored, "target": stored["target"][:1]},
+        lambda stored: {**stored, "target": [1, 2]},
+        lambda stored: {**stored, "history": []},
+        lambda stored: torch.nn.Linear(2, 2),
+    ],
+)
+def test_a_network_file_of_another_kind_is_refused(tiny_run, run_dir, tmp_path, other):
+    folder = shutil.copytree(run_dir, tmp_path / "run")
+    stored = torch.load(folder / "network.pt", weights_only=True)
+    torch.save(other(stored), folder / "network.pt")
+    with pytest.raises(UsageError, match=r"network\.pt: expected a network of this release"):
+        load_run(folder)
+
+
 def test_an_unfinished_run_cannot_be_published(tmp_path):
     with pytest.raises(UsageError, match="finished run"):
         load_run(tmp_path)
@@ -149,6 +171,47 @@ def test_features_of_other_pixels_are_not_shared(tiny_run, tmp_path):
     assert shared_folder(tmp_path, tiny_run.config, "w", images) == before
     images.images[3, 2, 1] ^= 1
     assert shared_folder(tmp_path, tiny_run.config, "w", images) != before
+
+
+def damaged(run_dir, folder, change):
+    """A copy of a run that did not end, whose checkpoint is changed."""
+    shutil.copytree(run_dir, folder)
+    (folder / "network.pt").unlink()
+    path = folder / "checkpoint-cjp.pt"
+    state = torch.load(path, weights_only=True)
+    torch.save(change({**state, "ended": False, "step": state["step"] // 2}), path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda state: torch.zeros(3),
+        lambda state: {key: state[key] for key in state if key != "ended"},
+        lambda state: {**state, "phase": "x"},
+        lambda state: {**state, "phase": 7},
+        lambda state: {**state, "step": "a"},
+        lambda state: {**state, "torch_rng": torch.zeros(3, dtype=torch.uint8)},
+        lambda state: {**state, "optimiser": {}},
+        lambda state: {**state, "averaged": {}},
+    ],
+)
+def test_a_checkpoint_of_another_kind_is_refused(tiny_run, run_dir, tmp_path, change):
+    damaged(run_dir, tmp_path / "run", change)
+    with pytest.raises(UsageError, match="expected a checkpoint of this version"):
+        train(tmp_path / "run", tiny_run.config, ignore_progress)
+
+
+def test_features_of_another_kind_are_made_anew(tmp_path):
+    path = tmp_path / "a.npz"
+    # numpy below 2.2 stores an argument that it does not know as an array of this name.
+    arrays = {"features": np.zeros((2, 3)), "poses": np.zeros((2, 7))}
+    np.savez(path, **arrays, allow_pickle=np.array(False))
+    assert features._stored(path, 2).keys() == arrays.keys()
+    for content in (b"", b"PK", path.read_bytes()[:100], b"\x80\x04N.", b"\x93NUMPY"):
+        path.write_bytes(content)
+        assert features._stored(path, 2) is None
+    np.savez(path, features=np.zeros(()), poses=np.array(None, dtype=object))
+    assert features._stored(path, 2) is None
 
 
 def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(tmp_path):

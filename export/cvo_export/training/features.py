@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Lock
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -161,13 +160,16 @@ def cached_copies(
 
 
 def _stored(path: Path, count: int) -> dict[str, NDArray[Any]] | None:
-    """Return arrays of ``count`` rows each, or None if the file is missing or incomplete."""
+    """Return the arrays of ``count`` rows each, or None if the file is missing or incomplete."""
     try:
-        with np.load(path) as stored:
-            arrays = dict(stored)
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        with path.open("rb") as stream, np.load(stream) as stored:
+            arrays = {name: stored[name] for name in ("features", "poses")}
+            return arrays if {len(array) for array in arrays.values()} == {count} else None
+    except MemoryError:
+        raise
+    # numpy and zipfile fail in a dozen ways on a file that holds anything else.
+    except Exception:  # noqa: BLE001
         return None
-    return arrays if {len(array) for array in arrays.values()} == {count} else None
 
 
 def _store(path: Path, arrays: dict[str, NDArray[Any]]) -> None:

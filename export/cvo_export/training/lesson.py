@@ -6,7 +6,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pickle import UnpicklingError
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -153,10 +153,11 @@ class Lesson:
         best: dict[str, Any] = {"score": math.inf, "weights": _cloned(learning), "count": 0}
         start = 0
         if state is not None:
-            optimiser.load_state_dict(state["optimiser"])
-            averaged.load_state_dict(state["averaged"])
-            best, start = state["best"], state["step"]
-            torch.set_rng_state(state["torch_rng"])
+            with _of_this_version(self._path):
+                optimiser.load_state_dict(state["optimiser"])
+                averaged.load_state_dict(state["averaged"])
+                best, start = state["best"], int(state["step"])
+                torch.set_rng_state(state["torch_rng"])
         every = max(1, steps // _EVALUATIONS)
         for step in range(start, steps):
             if best["count"] >= _PATIENCE:
@@ -224,23 +225,33 @@ class Lesson:
     def _read_checkpoint(self) -> dict[str, Any] | None:
         if not self._path.is_file():
             return None
-        try:
+        with _of_this_version(self._path):
             state: dict[str, Any] = torch.load(self._path, weights_only=True)
             self.both.load_state_dict(state["weights"])
-            self._learning(state["phase"]).load_state_dict(state["best"]["weights"])
+            self._learning(int(state["phase"])).load_state_dict(state["best"]["weights"])
             self.both.load_state_dict(state["weights"])
             self.history = [History(*entry) for entry in state["history"]]
-        # torch fails on another network's file, History on another release's entries.
-        except (RuntimeError, KeyError, TypeError, UnpicklingError, EOFError):
-            raise UsageError(
-                f"{self._path}: expected a checkpoint of this version, found another file; remove "
-                "it to restart training"
-            ) from None
+            if not {"step", "ended"} <= state.keys() or state["phase"] not in range(3):
+                raise KeyError("step")
         return state
 
 
 def _cloned(module: nn.Module) -> dict[str, Tensor]:
     return {key: value.clone() for key, value in module.state_dict().items()}
+
+
+@contextmanager
+def _of_this_version(path: Path) -> Iterator[None]:
+    """Raise UsageError for whatever fails, but for memory: a file may hold anything."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception:  # noqa: BLE001
+        raise UsageError(
+            f"{path}: expected a checkpoint of this version, found another file; remove it to "
+            "restart training"
+        ) from None
 
 
 @contextmanager

@@ -300,18 +300,18 @@ def load_run(run_dir: str | os.PathLike[str], dataset: str | None = None) -> Run
     try:
         config = decode_config((run_dir / CONFIG_FILE).read_bytes())
         recorded = read_split_spec(run_dir / SPLIT_FILE)
-        stored = torch.load(path, weights_only=True)
-    # torch.load passes on any error of its unpickler and its zip reader.
+    # Whatever a damaged file makes of these readers.
     except Exception as error:  # noqa: BLE001
         line = " ".join(str(error).split())[:120]
         raise UsageError(f"{run_dir}: cannot read the files of the run: {line}") from None
     opened = open_dataset(dataset or config.dataset)
     split = same_split(opened, recorded)
-    target = Target.of_arrays([values.numpy() for values in stored["target"]])
     backbone, upper, _ = loaded_backbone(config, NO_WEIGHTS)
-    setting = Setting(backbone.size, target, config.seed, upper)
     restore = TRAINABLE[config.method].restore
     try:
+        stored = torch.load(path, weights_only=True)
+        target = Target.of_arrays([values.numpy() for values in stored["target"]])
+        setting = Setting(backbone.size, target, config.seed, upper)
         backbone.load_state_dict(stored["backbone"])
         head = restore(setting, config.head, stored["head"])
         # A run of an earlier release has no key for folds.
@@ -319,10 +319,14 @@ def load_run(run_dir: str | os.PathLike[str], dataset: str | None = None) -> Run
             restore(setting, config.head, state).eval() for state in stored.get("folds", ())
         )
         history = [History(*entry) for entry in stored["history"]]
-    except (RuntimeError, TypeError):
+        weights_sha256, _ = stored["weights_sha256"], history[-1]
+    except MemoryError:
+        raise
+    # torch passes on any error of its unpickler and its zip reader; a file may hold anything.
+    except Exception:  # noqa: BLE001
         raise UsageError(
-            f"{run_dir}: expected a network of this release, found another release's in "
-            f"{NETWORK_FILE}; train it again"
+            f"{path}: expected a network of this release, as train writes it, found another file; "
+            "copy the run again, or train it again"
         ) from None
     graph = PoseGraph(backbone, head).eval()
-    return Run(config, opened, split, target, graph, stored["weights_sha256"], history, folds)
+    return Run(config, opened, split, target, graph, weights_sha256, history, folds)
