@@ -309,7 +309,7 @@ def test_a_frame_without_an_interval_covers_nothing(bundle_dir, clip_dir, tmp_pa
         # Every second image is black.
         cv2.imwrite(str(frames / path.name), image * (number % 2))
     shown = cvo_edge("run", bundle_dir, frames, "--ground-truth", clip_dir)
-    counted = [line for line in shown.stderr.splitlines() if line.startswith("coverage")]
+    counted = [line for line in shown.stderr.splitlines() if line.startswith("all six")]
     assert counted[0].endswith("of 2 frames")
     for path in frames.iterdir():
         cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path))))

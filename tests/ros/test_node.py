@@ -337,3 +337,56 @@ def test_the_files_of_the_package_agree():
         if isinstance(node, ast.Assign)
     )
     assert set(launched) <= names
+
+
+# Its libraries use what Python will not have for ever.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_node_answers_over_ros(bundle_dir, clip_dir, monkeypatch):
+    """With rclpy: two images after CameraInfo, one of them black, from another node."""
+    rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    from diagnostic_msgs.msg import DiagnosticArray
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+    from rclpy.executors import SingleThreadedExecutor
+    from sensor_msgs.msg import CameraInfo, Image
+
+    from cvo_edge_ros.node import NEWEST_IMAGE, Odometry
+
+    given = {"bundle": str(bundle_dir), "map": "0,0,1,0,0,0,1"}
+    arguments = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+    rclpy.init(args=["--ros-args", *arguments])
+    try:
+        node, talker, executor = Odometry(), rclpy.create_node("talker"), SingleThreadedExecutor()
+        for each in (node, talker):
+            executor.add_node(each)
+        poses, statuses = [], []
+        talker.create_subscription(PoseWithCovarianceStamped, "cvo/pose", poses.append, 10)
+        talker.create_subscription(DiagnosticArray, "/diagnostics", statuses.append, 10)
+        info = talker.create_publisher(CameraInfo, "camera_info", NEWEST_IMAGE)
+        images = talker.create_publisher(Image, "image_raw", NEWEST_IMAGE)
+        camera = Odometer.load(bundle_dir).calibration.camera
+        k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+        picture = next(iter(open_source(str(clip_dir)))).image
+        for image, level in ((picture, b"\x00"), (0 * picture, b"\x02")):
+            message = Image(
+                height=image.shape[0],
+                width=image.shape[1],
+                encoding="bgr8",
+                step=image.strides[0],
+                data=array("B", image.tobytes()),
+            )
+            # Both ends have to find each other: what is sent before is lost.
+            for _ in range(300):
+                if statuses and statuses[-1].status[0].level == level:
+                    break
+                info.publish(CameraInfo(width=camera.width, height=camera.height, k=k))
+                message.header.stamp = talker.get_clock().now().to_msg()
+                images.publish(message)
+                executor.spin_once(timeout_sec=0.1)
+        node.close()
+        said = {each.status[0].message.partition(",")[0] for each in statuses}
+        assert said == {"ok", "image_black"}
+        assert poses[0].header.frame_id == "map"
+        assert min(np.array(poses[0].pose.covariance).reshape(6, 6).diagonal()) > 0.0
+    finally:
+        rclpy.try_shutdown()
