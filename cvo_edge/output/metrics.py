@@ -75,7 +75,7 @@ class MetricsSink:
         for status in Status:
             self._frames.labels(status.value)
         self._skipped = kinds.Counter(
-            "cvo_skipped_frames", "Frames dropped for newer ones.", registry=registry
+            "cvo_dropped_frames", "Frames dropped for newer ones.", registry=registry
         )
         self._next_seq = 0
         self._reasons = kinds.Counter(

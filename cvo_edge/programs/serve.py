@@ -126,13 +126,19 @@ def serve(
         placing=(base, map, frame_id, child_frame_id, unknown_variance),
     )
     check_output(output, source, bundle, public_key, camera, state, force=None)
-    waiting, notifier = Waiting(say), Notifier()
-    service = Service(waiting, notifier, say, health_every)
+    notifier = Notifier()
+
+    def told(line: str) -> None:
+        say(line)
+        notifier.status(line)
+
+    waiting = Waiting(told)
+    service = Service(waiting, notifier, told, health_every)
 
     def around(what: str, opening: Opening) -> AbstractContextManager[Writing]:
         if what == "metrics":
             return opening()
-        service.sinks.append(Dropping(what, opening, say))
+        service.sinks.append(Dropping(what, opening, told))
         return service.sinks[-1]
 
     if sys.stderr is not None:

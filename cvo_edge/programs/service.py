@@ -96,7 +96,7 @@ class Service:
     def figures(self) -> dict[str, float | str]:
         """Return the account of all frames.
 
-        ``delivered`` = ``frames`` + ``skipped`` + ``pending``; ``frames`` = ``records`` +
+        ``delivered`` = ``frames`` + ``dropped_frames`` + ``pending``; ``frames`` = ``records`` +
         ``dropped_records``.
         """
         job = self._job
@@ -109,7 +109,7 @@ class Service:
             "delivered": delivered,
             "frames": summary.frames,
             **{status.value: summary.statuses[status] for status in Status},
-            "skipped": summary.skipped,
+            "dropped_frames": summary.skipped,
             "pending": max(0, delivered - done),
         }
         for sink in self.sinks:
@@ -161,10 +161,10 @@ class Service:
     def lines(self) -> list[str]:
         """Return the account as lines of the summary."""
         figures = self.figures()
-        text = (
-            "{delivered} frames delivered = {frames} estimated + {skipped} dropped for newer ones"
-        )
-        lines = ["account     " + text.format(**figures)]
+        lines = [
+            f"account     {figures['delivered']} frames delivered = {figures['frames']} estimated"
+            f" + {figures['dropped_frames']} dropped for newer ones"
+        ]
         if figures["pending"]:
             lines[0] += f" + {figures['pending']} unfinished"
         lines += [
@@ -176,9 +176,7 @@ class Service:
 
     def say_health(self) -> None:
         """Say the health line now."""
-        line = self.health()
-        self._told(line)
-        self._notifier.status(line)
+        self._told(self.health())
 
     # -- the watch --------------------------------------------------------------------------------
 
