@@ -7,8 +7,6 @@ camera, its box and the bands, so that nothing of an earlier frame is seen in it
 from __future__ import annotations
 
 import os
-import socket
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -248,6 +246,10 @@ class _Copy:
 
 def _open_viewer() -> None:
     """Start a viewer on loopback unless one is there; raises UsageError without a display."""
+    # Imported here because most runs have no viewer.
+    import socket
+    import subprocess
+
     with socket.socket() as probe:
         probe.settimeout(1.0)
         if probe.connect_ex((_HOST, _PORT)) == 0:
