@@ -207,6 +207,19 @@ def test_a_clock_that_steps_is_said_once_and_changes_nothing(clock, way, step_s,
     assert told.said["alive"] == 120
 
 
+def test_a_clock_that_is_read_late_has_not_stepped(clock, monkeypatch):
+    service, told, *_ = watched(clock)
+    real = clock.time_ns
+
+    def late():
+        clock.now += 1.5
+        return real()
+
+    monkeypatch.setattr(clock, "time_ns", late)
+    service.look()
+    assert told.lines == []
+
+
 def test_a_process_that_stood_still_says_so_and_is_alive(clock):
     service, told, *_ = watched(clock)
     for gap_s in (1.0, 1.0, 90.0, 1.0):
