@@ -276,11 +276,6 @@ class Odometer(Labelled):
         Raises the source's errors; raises UsageError for a path instead of a source and, in
         ``live`` mode, for a recording without stamps.
         """
-        if isinstance(frames, str | bytes | os.PathLike):
-            raise UsageError(
-                f"stream: expected frames or a source, found the path {os.fsdecode(frames)}; use "
-                "odometer.stream(open_source(path))"
-            )
         moving = checked_hint(moving)
         self._watch = StreamWatch(self._observer, self.calibration)
         with closing(

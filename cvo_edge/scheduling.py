@@ -13,6 +13,7 @@ in the order of the frames.
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -91,9 +92,14 @@ def run_stream(
     clock
         Paces a recording in ``live`` and dates the arrival of frames.
 
-    Raises errors of the source and of ``work`` after the results of earlier frames, and in ``live``
-    UsageError for a recording without stamps.
+    Raises errors of the source and of ``work`` after the results of earlier frames, and UsageError
+    for what holds no frames, such as a path, and in ``live`` for a recording without stamps.
     """
+    if isinstance(frames, str | bytes | os.PathLike) or not isinstance(frames, Iterable):
+        raise UsageError(
+            f"stream: expected frames or a source, found {frames!r:.80}; a path is opened by "
+            "open_source(path)"
+        )
     # A camera must be read continuously; frames left in its queue become stale.
     if mode == "live" or (isinstance(frames, Source) and frames.live):
         with closing(_newest(frames, clock)) as newest:

@@ -52,6 +52,10 @@ class FrontEnd:
         self._t = np.zeros(3)
         self._q = np.array([0.0, 0.0, 0.0, 1.0])
 
+    def __repr__(self) -> str:
+        camera = self.camera
+        return f"<FrontEnd {camera.width}x{camera.height}, {self._seq} frames>"
+
     def stream(self, frames: Iterable[Frame | NDArray[Any]]) -> Generator[Step, None, None]:
         """Yield a step for each frame of a source; of a live one, for the newest frames.
 

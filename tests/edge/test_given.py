@@ -10,6 +10,7 @@ import pytest
 
 from cvo_edge import (
     Frame,
+    FrontEnd,
     ModelCache,
     Odometer,
     open_source,
@@ -77,6 +78,15 @@ def test_a_copy_has_the_settings_and_starts_a_stream(bundle_dir, images):
     refused = pytest.raises(UsageError, match=r"copy: expected an odometer of Odometer\.load")
     with Odometer(read_bundle(bundle_dir)) as odometer, refused:
         pickle.dumps(odometer)
+
+
+@pytest.mark.parametrize("frames", ["frames", b"frames", Path("frames"), None, 5])
+def test_a_stream_is_of_frames_and_not_of_a_path(bundle_dir, frames):
+    front_end = FrontEnd(read_camera("640x480,500,500,320,240"))
+    with Odometer.load(bundle_dir) as odometer:
+        for each in (odometer, front_end):
+            with pytest.raises(UsageError, match=r"stream: expected frames or a source, found"):
+                next(each.stream(frames))
 
 
 @pytest.mark.parametrize("stamp_ns", [-1, 2**63, 10**30])
