@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import sys
 import traceback
@@ -94,11 +95,13 @@ def _interrupts_ignored() -> Iterator[None]:
 
 
 def _worker(sender: Connection, task: Task) -> None:
-    import torch
-
     # Unwind, so that no temporary file or semaphore is left behind.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    torch.set_num_threads(1)
+    # Loading torch takes seconds: it is not loaded for tasks without it, and reads this if it is
+    # loaded later.
+    os.environ["OMP_NUM_THREADS"] = "1"
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
     sender.send(attempt(task))
 
 
