@@ -15,7 +15,7 @@ from cvo_export.training.loop import train
 from cvo_export.training.material import shared_folder
 from cvo_export.training.run import load_run
 
-from .conftest import ignore_progress, tiny_config
+from .conftest import DATASET, ignore_progress, tiny_config
 
 
 def same_weights(first, second):
@@ -61,13 +61,14 @@ def test_a_run_that_is_interrupted_three_times_ends_as_if_it_never_was(tiny_run,
 
 
 def test_fine_tuning_is_resumable_and_changes_the_backbone(tmp_path):
-    config = tiny_config(fine_tune=1, steps=100)
+    few = {"dataset": DATASET.replace("frames=40", "frames=20"), "steps": 30}
+    config = tiny_config(fine_tune=1, **few)
     whole = train(tmp_path / "whole", config, ignore_progress)
     with pytest.raises(InterruptedTrainingError):
         train(tmp_path / "broken", config, stopping_after(3, "fine-tuning"))
     resumed = train(tmp_path / "broken", config, ignore_progress)
     assert same_weights(whole, resumed)
-    frozen = train(tmp_path / "frozen", tiny_config(steps=100), ignore_progress)
+    frozen = train(tmp_path / "frozen", tiny_config(**few), ignore_progress)
     stem = "backbone.body.conv_stem.weight"
     assert not torch.equal(whole.graph.state_dict()[stem], frozen.graph.state_dict()[stem])
 
@@ -77,8 +78,9 @@ def test_a_run_folder_of_other_options_is_refused(tiny_run, run_dir):
         train(run_dir, tiny_config(seed=1), ignore_progress)
 
 
-def test_a_full_disk_is_one_line_and_the_run_resumes(tiny_run, tmp_path, files_limited):
-    folder = tmp_path / "run"
+def test_a_full_disk_is_one_line_and_the_run_resumes(tmp_path, files_limited):
+    folder, config = tmp_path / "run", tiny_config(steps=30)
+    whole = train(tmp_path / "whole", config, ignore_progress)
     for limit, file in [
         (100, "split.json"),
         (100_000, r"features-0/\S*.npz"),
@@ -86,13 +88,13 @@ def test_a_full_disk_is_one_line_and_the_run_resumes(tiny_run, tmp_path, files_l
     ]:
         full = pytest.raises(SinkError, match=rf"{file}: cannot be written: File too large$")
         with files_limited(limit), full:
-            train(folder, tiny_config(), ignore_progress)
+            train(folder, config, ignore_progress)
         assert not list(folder.rglob("*.partial"))
-    assert same_weights(tiny_run, train(folder, tiny_config(), ignore_progress))
+    assert same_weights(whole, train(folder, config, ignore_progress))
     (folder / "network.pt").unlink()
     full = pytest.raises(SinkError, match=r"network.pt: cannot be written: File too large$")
     with files_limited(100_000), full:
-        train(folder, tiny_config(), ignore_progress)
+        train(folder, config, ignore_progress)
     assert not list(folder.rglob("*.partial"))
 
 
