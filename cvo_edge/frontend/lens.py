@@ -59,7 +59,12 @@ class Lens:
         if camera.distortion == "equidistant":
             found = cv2.fisheye.undistortPoints(*given, criteria=_CRITERIA)
         else:
-            found = cv2.undistortPoints(*given, criteria=_CRITERIA)
+            # OpenCV 4 has another function for it.
+            iterate = getattr(cv2, "undistortPointsIter", None)
+            if iterate is None:
+                found = cv2.undistortPoints(*given, criteria=_CRITERIA)
+            else:
+                found = iterate(*given, np.eye(3), np.eye(3), _CRITERIA)
         rays[:2] = found[:, 0].T
         if self._valid is not None:
             column, row = np.rint(points / _APART_PX).astype(np.int64).T

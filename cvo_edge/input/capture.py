@@ -281,7 +281,7 @@ class _Stated(NamedTuple):
 class _Opened:
     """The capture and the ages of its frames; only the reading thread uses it."""
 
-    def __init__(self, capture: Device, clock: Clock, threads: int | None) -> None:
+    def __init__(self, capture: Device, clock: Clock, threads: int | None = None) -> None:
         self._capture, self._clock, self._threads = capture, clock, threads
         self._account = LagAccount(clock.now_s(), 0.0)
         self._driver: DriverStamps | None = None

@@ -16,6 +16,7 @@ from cvo_edge.input.capture import shown
 from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
 from cvo_edge.input.frame import Frame
 from cvo_edge.input.image_files import (
+    BESIDE,
     NOT_COLOUR,
     frame_name,
     mark_of,
@@ -143,7 +144,7 @@ class FollowedFolder:
             if not reason and self._colour and not colour:
                 reason = NOT_COLOUR
             if reason := reason or first.get(name, ""):
-                self.left_out[reason] += 1
+                self.left_out.update({reason} - BESIDE)
             else:
                 images.append(name)
         return images

@@ -23,6 +23,8 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tif
 # Videos whose first bytes are those of an image.
 _JPEGS_IN_A_ROW = (".mjpg", ".mjpeg")
 
+# Poses, stamps and cameras are kept beside images.
+BESIDE = frozenset((".txt", ".csv", ".json", ".yaml", ".yml"))
 NOT_COLOUR = "not marked as colour"
 # Words in a file's name that say what the image shows.
 _COLOUR = frozenset(("color", "colour", "rgb"))
@@ -157,13 +159,16 @@ def colour_images(
 
     A mark is a word of the name, e.g. ``depth`` in ``00001-depth.png``. Images marked as anything
     but colour are left out; if some of the others are marked as colour, only those are used.
-    Files with another suffix are counted, too. ``others`` are what was left out before.
+    Files with another suffix are counted, too, but for those of poses and lists. ``others`` are
+    what was left out before.
     """
     unmarked: list[str] = []
     colour: list[str] = []
     left_out = Counter(others or {})
     for file in files:
         is_colour, reason = mark_of(file.rpartition("/")[2])
+        if reason in BESIDE:
+            continue
         if reason:
             left_out[reason] += 1
         else:

@@ -51,13 +51,13 @@ def test_images_come_in_natural_order_and_then_as_they_appear(tmp_path, clock):
         (tmp_path / ".hidden").rename(tmp_path / "1.jpg")
 
     def several():
-        for name in ("12.jpg", "3.jpg", "a.txt", "3-depth.png"):
+        for name in ("12.jpg", "3.jpg", "a.heic", "a.txt", "3-depth.png"):
             put(tmp_path, name)()
 
     source = follow(tmp_path, clock, [put(tmp_path, "11.jpg"), renamed, several])
     found = [(frame.source, frame.image is not None) for frame in source]
     assert found == [(f"{n}.jpg", True) for n in (9, 10, 11, 1, 3, 12)]
-    assert source.left_out == {".txt": 1, "marked depth": 1}
+    assert source.left_out == {".heic": 1, "marked depth": 1}
     # It ends by the time without an image.
     assert 4.0 <= clock.now <= 4.5
 

@@ -251,7 +251,7 @@ class StampingDriver:
 def test_the_age_of_a_frame_that_a_driver_stamps_is_known(clock):
     clock.now = 1000.0
     opened = _Opened(StampingDriver(clock, [999.9, 995.0, 996.0]), clock)
-    opened.open(0)
+    opened.open(0, 1.0)
     found = [opened.grab().queued_ms for _ in range(3)]
     assert found == pytest.approx([101.0, 5002.0, 4003.0])
 
@@ -260,7 +260,7 @@ def test_the_age_of_a_frame_that_a_driver_stamps_is_known(clock):
 def test_a_driver_s_stamp_of_another_clock_is_not_believed(clock, stamp_s):
     clock.now = 1000.0
     opened = _Opened(StampingDriver(clock, [stamp_s] * 9), clock)
-    opened.open(0)
+    opened.open(0, 1.0)
     clock.now += 5.0
     assert opened.grab().queued_ms > 4900.0
 
@@ -268,7 +268,7 @@ def test_a_driver_s_stamp_of_another_clock_is_not_believed(clock, stamp_s):
 def test_the_position_of_another_backend_is_no_stamp(clock):
     clock.now = 1000.0
     opened = _Opened(StampingDriver(clock, [999.0], backend="FFMPEG"), clock)
-    opened.open(0)
+    opened.open(0, 1.0)
     assert opened.grab().queued_ms < 900.0
 
 

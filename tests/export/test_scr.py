@@ -135,7 +135,7 @@ def test_a_run_that_is_interrupted_at_every_stage_ends_as_if_it_never_was(runs, 
 def learned(tmp_path_factory):
     """A run that learned its place, unlike the others, which only pass through every step."""
     folder = tmp_path_factory.mktemp("learned") / "fused"
-    head = FusedConfig(width=64, blocks=1, cell_steps=800)
+    head = FusedConfig(width=64, blocks=1, cell_steps=1500)
     with mapped_once():
         run = train(folder, config("fused", head=head, steps=400, averaging=0.98), ignore_progress)
     bundle = folder.with_name("bundle")

@@ -43,8 +43,7 @@ class FrameList:
     def colour_images(self, folder: Path) -> list[Path]:
         """Return the colour images of a folder, as the runtime chooses them; count the others."""
         listing = images_in(folder)
-        # Files of poses lie beside images.
-        self._left_out.update({key: n for key, n in listing.left_out.items() if key != ".txt"})
+        self._left_out.update(listing.left_out)
         return listing.images
 
     def add(
