@@ -98,7 +98,10 @@ def _confidences(calibration: Calibration) -> str:
     table = calibration.quantiles
     if table is None:
         return "those below; the bundle holds no quantiles for others"
-    ends = ", ".join(f"{each.scope} {each.confidence:.4g}" for each in reaches(calibration))
+    # Rounded downwards: beyond the end, a confidence is unbounded.
+    ends = ", ".join(
+        f"{each.scope} {math.floor(1e6 * each.confidence) / 1e6:g}" for each in reaches(calibration)
+    )
     return f"any, by {len(table.confidences)} quantiles; finite up to {ends}"
 
 

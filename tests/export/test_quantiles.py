@@ -73,7 +73,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("n", [30, 700])
+@pytest.mark.parametrize("n", [5, 30, 700])
 @pytest.mark.parametrize(("method", "sides", "rule", "cap", "joint"), CASES)
 def test_a_threshold_is_never_below_the_exact_one(
     artifacts_dir, method, sides, rule, cap, joint, n
@@ -94,6 +94,11 @@ def test_a_threshold_is_never_below_the_exact_one(
     calibration = decode_calibration(content)
     check_plausible(calibration, checked_head(calibration))
     assert calibration.quantiles is not None
+    if sides == "symmetric" and method not in ("mcqr", "scr"):
+        for confidence in generator.uniform(0.0, 1.0, 40):
+            each, six = (numbers(threshold_at(calibration, confidence, scope)) for scope in SCOPES)
+            with np.errstate(invalid="ignore"):
+                assert not (six < each - 1e-9).any()
     for entry in calibration.thresholds:
         assert threshold_at(calibration, entry.confidence, entry.scope) == entry
     for reach in reaches(calibration):

@@ -43,6 +43,8 @@ def with_quantiles(calibration: Calibration, head: Head, bounds: Bounds) -> Cali
     symmetric = head.side_confidences(_HIGH) == (_HIGH,)
     for every, below in ((1, 1.0), (2, _HIGH), (4, _HIGH), (4, 1.0), (16, 1.0)):
         kept = _kept(confidences, exact, every, below)
+        if not kept:
+            break
         table = _table(calibration, head, confidences, exact, kept, symmetric=symmetric)
         found = replace(calibration, schema_version=2, quantiles=table)
         try:

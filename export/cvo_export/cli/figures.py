@@ -104,7 +104,9 @@ def plot(
         Subset, typer.Option(help="The run's test frames, or all frames of unseen data.")
     ] = "test",
     sequence: Annotated[str | None, typer.Option(help="Only this sequence.")] = None,
-    confidence: Annotated[float, typer.Option(help="A confidence stored in the bundle.")] = 0.9,
+    confidence: Annotated[
+        float, typer.Option(help="One stored in the bundle, or any if it holds quantiles.")
+    ] = 0.9,
     scope: Annotated[
         Scope,
         typer.Option(
