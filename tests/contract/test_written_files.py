@@ -7,7 +7,8 @@ import pytest
 import typer
 
 from cvo_edge.errors import SinkError, UsageError
-from cvo_edge.files import check_output
+from cvo_edge.files import check_output, picture_metadata
+from cvo_edge.output.drawing import write_png
 from cvo_edge.programs.cli import app as edge
 from cvo_export.cli import app as export
 
@@ -42,12 +43,13 @@ WRITERS = {
     ("plot", "out"): f"plot {BUNDLE} {ROOM} --subset all --out OUT",
     ("dataset", "picture"): f"dataset {ROOM} --picture OUT",
 }
+# What they write is written by functions that others call, too: only that they refuse is tried.
+SLOW = [("demo", "picture"), ("evaluate", "json_file"), ("plot", "out")]
 SUFFIXES = {
     ("run", "output"): (".jsonl", ".csv", ".tum", ".mcap"),
     ("odometry", "output"): (".jsonl", ".tum"),
     ("annotate", "output"): (".jsonl", ".csv", ".tum"),
     ("convert", "output"): (".jsonl", ".csv", ".tum", ".mcap", ".rrd"),
-    ("plot", "out"): (".pdf",),
     ("dataset", "picture"): (".svg",),
 }
 # A service adds to its file and replaces none.
@@ -131,11 +133,26 @@ def test_only_files_of_ours_are_replaced_without_force(key, command, suffix, giv
             "name, or --force to replace it"
         )
         assert path.read_bytes() == content
-    app([*words, "--force"], standalone_mode=False)
-    assert path.read_bytes() not in FOREIGN.values()
-    # It says whose it is.
-    check_output(path)
+    if key not in SLOW:
+        app([*words, "--force"], standalone_mode=False)
+        assert path.read_bytes() not in FOREIGN.values()
+        # It says whose it is.
+        check_output(path)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_pictures_of_every_format_say_whose_they_are(tmp_path):
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    path = tmp_path / "demo.png"
+    write_png(path, np.zeros((4, 4, 3), np.uint8))
+    check_output(path)
+    for suffix in (".png", ".svg", ".pdf"):
+        path = tmp_path / f"a{suffix}"
+        figure.savefig(path)
+        with pytest.raises(UsageError, match="found another one"):
+            check_output(path)
+        figure.savefig(path, metadata=picture_metadata(suffix))
+        check_output(path)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".tum", ".jsonl", ".mcap"])
