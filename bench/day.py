@@ -258,16 +258,16 @@ def account(life: Life, seqs: list[int]) -> dict[str, Any]:
     told, written = ACCOUNT.search(text), WRITTEN.search(text)
     if told is None or written is None:
         return {"unsaid": None, "lines": life.lines[-3:]}
-    delivered, frames, skipped = map(int, told.groups())
-    records, dropped = map(int, written.groups())
+    delivered, frames, dropped_frames = map(int, told.groups())
+    records, dropped_records = map(int, written.groups())
     return {
         "delivered": delivered,
         "frames": frames,
-        "skipped": skipped,
+        "dropped_frames": dropped_frames,
         "records_said": records,
-        "dropped": dropped,
+        "dropped_records": dropped_records,
         "records_read": len(seqs),
-        "unsaid": delivered - skipped - dropped - len(seqs),
+        "unsaid": delivered - dropped_frames - dropped_records - len(seqs),
     }
 
 

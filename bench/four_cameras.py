@@ -79,9 +79,9 @@ def four_processes(
         told, written = ACCOUNT.search(text), WRITTEN.search(text)
         if told is None or written is None:
             raise SystemExit(text)
-        delivered, frames, skipped = map(int, told.groups())
+        delivered, frames, dropped_frames = map(int, told.groups())
         path = folder / f"{number}.jsonl"
-        cameras.append(_account(path, delivered, frames, skipped, int(written[2])))
+        cameras.append(_account(path, delivered, frames, dropped_frames, int(written[2])))
     return {"cameras": cameras, "cores_used": used_s / passed_s}
 
 
@@ -137,16 +137,18 @@ def streams(bundle: Path, addresses: list[str], folder: Path, seconds: float) ->
     return {"counts": counts, "cores_used": cores_used}
 
 
-def _account(path: Path, delivered: int, frames: int, skipped: int, dropped: int) -> dict[str, Any]:
+def _account(
+    path: Path, delivered: int, frames: int, dropped_frames: int, dropped_records: int
+) -> dict[str, Any]:
     records = list(read_records(path))
     total_ms = [record.latency_ms["total"] for record in records]
     return {
         "delivered": delivered,
         "frames": frames,
-        "skipped": skipped,
-        "dropped": dropped,
+        "dropped_frames": dropped_frames,
+        "dropped_records": dropped_records,
         "records": len(records),
-        "unsaid": delivered - skipped - dropped - len(records),
+        "unsaid": delivered - dropped_frames - dropped_records - len(records),
         "p50_ms": round(float(np.percentile(total_ms, 50)), 2),
         "p99_ms": round(float(np.percentile(total_ms, 99)), 2),
     }

@@ -28,7 +28,7 @@ def _shown(line: str) -> str:
 def day_account() -> str:
     """Return a row for each process of the day."""
     found = read_result("service", "day")
-    keys = ("delivered", "skipped", "dropped", "records_read", "unsaid")
+    keys = ("delivered", "dropped_frames", "dropped_records", "records_read", "unsaid")
     rows = [
         [str(number), *(str(life[key]) for key in keys)]
         for number, life in enumerate(found["lives"], start=1)
@@ -49,7 +49,7 @@ def four_cameras() -> str:
                 f"{run['way']}, {run['method']} {run['precision']}",
                 " ".join(str(each["delivered"]) for each in cameras),
                 " ".join(map(str, counts)),
-                " ".join(str(each["skipped"]) for each in cameras),
+                " ".join(str(each["dropped_frames"]) for each in cameras),
                 str(sum(each["unsaid"] for each in cameras)),
                 f"{min(counts) / max(counts):.2f}",
                 " ".join(f"{each['p50_ms']:.0f}" for each in cameras),

@@ -32,7 +32,7 @@ class Newest:
         self._frames, self._stop, self._clock = frames, stop, clock
         self._changed = Condition()
         self._frame: Frame | None = None
-        self._skipped = 0
+        self._dropped = 0
         self._closed = False
         self._ended = False
         self._failure: BaseException | None = None
@@ -46,11 +46,11 @@ class Newest:
             while True:
                 with self._changed:
                     self._changed.wait_for(lambda: self._frame or self._ended)
-                    frame, skipped, self._skipped = self._frame, self._skipped, 0
+                    frame, dropped, self._dropped = self._frame, self._dropped, 0
                     self._frame = None
                 if frame is None:
                     break
-                yield replace(frame, skipped=skipped)
+                yield replace(frame, skipped=dropped)
         finally:
             self._closed = True
             if self._stop is not None:
@@ -68,7 +68,7 @@ class Newest:
                     frame = replace(frame, arrived_s=self._clock.now_s() - read_s)
                 with self._changed:
                     # A source may have dropped frames itself.
-                    self._skipped += frame.skipped + (self._frame is not None)
+                    self._dropped += frame.skipped + (self._frame is not None)
                     self._frame = frame
                     self._changed.notify()
                 if self._closed:

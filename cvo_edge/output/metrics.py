@@ -74,7 +74,7 @@ class MetricsSink:
         )
         for status in Status:
             self._frames.labels(status.value)
-        self._skipped = kinds.Counter(
+        self._dropped = kinds.Counter(
             "cvo_dropped_frames", "Frames dropped for newer ones.", registry=registry
         )
         self._next_seq = 0
@@ -130,7 +130,7 @@ class MetricsSink:
     def write(self, estimate: PoseInterval) -> None:
         """Count one frame."""
         self._frames.labels(estimate.status.value).inc()
-        self._skipped.inc(max(0, estimate.seq - self._next_seq))
+        self._dropped.inc(max(0, estimate.seq - self._next_seq))
         self._next_seq = estimate.seq + 1
         for reason in estimate.reasons:
             self._reasons.labels(reason.value).inc()

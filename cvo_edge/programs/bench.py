@@ -54,7 +54,7 @@ class _Found:
     latency: LatencyProfile = field(default_factory=LatencyProfile)
     valid: int = 0
     in_alarm: int = 0
-    skipped: int = 0
+    dropped: int = 0
     wall_s: float = 0.0
     cpu_s: float = 0.0
     # From the first to the last frame, including the bare calls.
@@ -123,7 +123,7 @@ def benchmark(
         "frames": frames,
         "frames_valid": found.valid,
         "frames_in_alarm": found.in_alarm,
-        "frames_skipped": found.skipped,
+        "frames_skipped": found.dropped,
         "warmup": warmup,
         "latency_ms": found.latency.summary(),
         "raw_model_ms": quantiles(found.raw_ms),
@@ -187,7 +187,7 @@ def _streams(
             ages_ms = []
             cpu_begin, begin = process_time(), perf_counter()
             for estimate in islice(estimates, len(part)):
-                found.skipped += estimate.seq - before - 1
+                found.dropped += estimate.seq - before - 1
                 before = estimate.seq
                 if _counts(estimate, stream):
                     found.valid += estimate.pose is not None

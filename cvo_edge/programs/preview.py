@@ -78,7 +78,7 @@ class Preview:
         for line in _bars(estimate):
             shown.append(f"{line}\n", style=style)
         counts = "  ".join(f"{self._summary.statuses[each]} {each}" for each in Status)
-        shown.append(f"{counts}  {self._summary.skipped} dropped\n")
+        shown.append(f"{counts}  {self._summary.dropped} dropped\n")
         doubts = [*self._doubts, *[""] * (_TOLD - len(self._doubts))]
         shown.append("\n".join(_cut(line, _WIDTH) for line in doubts))
         return shown

@@ -86,7 +86,7 @@ class FramesProgress(_Line):
     def line(self, now: float) -> str:
         """Return the text at the time ``now``."""
         summary = self._summary
-        done = summary.frames + summary.skipped
+        done = summary.frames + summary.dropped
         rate = summary.frames / max(now - self._begin, 1e-9)
         parts = [f"{done} frames", f"{rate:.1f} fps"]
         if self._total is not None:

@@ -36,7 +36,7 @@ class RunSummary:
     """Counts, latencies and, with ground truth, coverage, in constant memory.
 
     ``truth`` gives the true poses; ``width_sum`` sums the widths of bounded frames, without gaps;
-    ``disjoint`` counts frames with a gap in some degree of freedom; ``skipped`` counts frames
+    ``disjoint`` counts frames with a gap in some degree of freedom; ``dropped`` counts frames
     dropped for a newer one; ``matched`` counts frames that have a true pose, ``compared`` those of
     status ok among them, and ``covered`` those whose set holds the true value, per degree of
     freedom; ``camera`` is what the frames show of the camera, if they do; ``left_out`` counts the
@@ -54,7 +54,7 @@ class RunSummary:
     latency: LatencyProfile = field(default_factory=LatencyProfile)
     bounded: int = 0
     disjoint: int = 0
-    skipped: int = 0
+    dropped: int = 0
     width_sum: Array = field(default_factory=lambda: np.zeros(6))
     matched: int = 0
     compared: int = 0
@@ -74,7 +74,7 @@ class RunSummary:
 
     def add(self, estimate: PoseInterval) -> None:
         """Count one estimate."""
-        self.skipped += estimate.seq - self._last_seq - 1
+        self.dropped += estimate.seq - self._last_seq - 1
         self._last_seq = estimate.seq
         self.statuses[estimate.status] += 1
         self.reasons.update(estimate.reasons)
@@ -126,8 +126,8 @@ class RunSummary:
         lines = [f"frames      {self.frames}: {counts}; {self.bounded} with finite bounds"]
         if self.left_out:
             lines.append(f"left out    {left_out_text(self.left_out)}")
-        if self.skipped:
-            lines.append(f"dropped     {self.skipped} frames, for newer ones")
+        if self.dropped:
+            lines.append(f"dropped     {self.dropped} frames, for newer ones")
         if self.disjoint:
             lines.append(f"bands       {self.disjoint} frames with a set in more than one piece")
         if self.reasons:

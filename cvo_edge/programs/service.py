@@ -103,13 +103,13 @@ class Service:
         if job is None:
             return {}
         summary, camera = job.summary, _camera(job)
-        done = summary.frames + summary.skipped
+        done = summary.frames + summary.dropped
         delivered = done if camera is None else camera.delivered
         found: dict[str, float | str] = {
             "delivered": delivered,
             "frames": summary.frames,
             **{status.value: summary.statuses[status] for status in Status},
-            "dropped_frames": summary.skipped,
+            "dropped_frames": summary.dropped,
             "pending": max(0, delivered - done),
         }
         for sink in self.sinks:
@@ -226,7 +226,7 @@ class Service:
         job, now = self._job, self._clock.awake_s()
         if job is None:
             return True
-        done, camera = job.summary.frames + job.summary.skipped, _camera(job)
+        done, camera = job.summary.frames + job.summary.dropped, _camera(job)
         idle = camera is not None and camera.delivered == done
         if stood:
             self._resumed_s = now

@@ -111,7 +111,7 @@ def camera_of(info: Any, image_topic: str) -> Camera:
         raise UsageError(f"camera_info: {error}") from None
 
 
-def frame_of(message: Any, skipped: int, now_ns: int, clock: Clock = SYSTEM_CLOCK) -> Frame:
+def frame_of(message: Any, dropped: int, now_ns: int, clock: Clock = SYSTEM_CLOCK) -> Frame:
     """Return the frame of a message with an image.
 
     ``now_ns``: the node's clock. A frame is as old as its stamp says; one without a stamp is
@@ -128,7 +128,7 @@ def frame_of(message: Any, skipped: int, now_ns: int, clock: Clock = SYSTEM_CLOC
         1e3 * (perf_counter() - start),
         queued_ms=max(0.0, 1e-6 * (now_ns - stamp_ns)),
         arrived_s=arrived_s,
-        skipped=skipped,
+        skipped=dropped,
     )
 
 
@@ -168,7 +168,7 @@ def answers(
             settings.child_frame_id or None,
             settings.unknown_variance or None,
         )
-        frames = (frame_of(message, skipped, now_ns()) for message, skipped in arrivals)
+        frames = (frame_of(message, dropped, now_ns()) for message, dropped in arrivals)
         moving = True if settings.always_moving else None
         before = None
         for estimate in odometer.stream(frames, moving=moving):

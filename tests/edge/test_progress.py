@@ -44,7 +44,7 @@ def test_without_a_length_it_tells_no_share_and_no_time_left():
 
 def test_dropped_frames_count_as_done_and_not_in_the_rate():
     summary = summary_of(ok=50)
-    summary.skipped = 50
+    summary.dropped = 50
     progress = FramesProgress(io.StringIO(), summary, 200, Clock())
     assert progress.line(110.0).startswith("100 of 200 frames (50%)  5.0 fps  0:10 left")
 

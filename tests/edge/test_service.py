@@ -231,7 +231,7 @@ def test_a_process_that_stood_still_says_so_and_is_alive(clock):
 
 def test_the_account_holds_while_frames_are_under_way(clock):
     service, _, camera, summary = watched(clock)
-    camera.delivered, summary.skipped = 10, 3
+    camera.delivered, summary.dropped = 10, 3
     summary.statuses.update(ok=4, degraded=1)
     figures = service.figures()
     assert (
