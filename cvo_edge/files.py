@@ -38,6 +38,10 @@ _OURS = re.compile(
 _PDF_END, _PDF_CREATOR = 1 << 16, b"/Creator (cvo-edge "
 
 
+# Permissions of the group and of everyone else.
+OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
 def regular_file(
     path: Path, limit: int, error: type[CvoError], *, links: bool = False
 ) -> io.BufferedReader:
@@ -91,14 +95,12 @@ def read_regular_file(
 
 def untrusted(found: os.stat_result) -> bool:
     """Whether others than this user and root own a file or folder, or may write to it."""
-    return found.st_uid not in (os.geteuid(), 0) or bool(
-        found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    )
+    return found.st_uid not in (os.geteuid(), 0) or bool(found.st_mode & OTHERS_WRITE)
 
 
 @contextmanager
 def whole_file(
-    path: Path, *, durable: bool = False, make_folder: bool = False
+    path: Path, *, durable: bool = False, make_folder: bool = False, own: bool = False
 ) -> Iterator[BinaryIO]:
     """Yield a stream whose content becomes the file when the block ends without an error.
 
@@ -111,6 +113,8 @@ def whole_file(
         Flush the file and its folder to the disk, so that this also holds after a power loss.
     make_folder
         Create the folder and its parents if they are missing.
+    own
+        Let nobody else write to the file, whatever the umask is; see ``untrusted``.
 
     Raises
     ------
@@ -127,6 +131,8 @@ def whole_file(
         raise _unwritable(path, error) from None
     try:
         with opened as stream:
+            if own:
+                os.fchmod(stream.fileno(), os.fstat(stream.fileno()).st_mode & ~OTHERS_WRITE)
             yield stream
             if durable:
                 stream.flush()
@@ -188,10 +194,15 @@ def _flush_folder(folder: Path) -> None:
 
 
 def write_whole(
-    path: Path, content: str | bytes, *, durable: bool = False, make_folder: bool = False
+    path: Path,
+    content: str | bytes,
+    *,
+    durable: bool = False,
+    make_folder: bool = False,
+    own: bool = False,
 ) -> None:
     """Write text (UTF-8) or bytes to a file, as ``whole_file`` does; raises SinkError."""
-    with whole_file(path, durable=durable, make_folder=make_folder) as stream:
+    with whole_file(path, durable=durable, make_folder=make_folder, own=own) as stream:
         stream.write(content.encode() if isinstance(content, str) else content)
 
 

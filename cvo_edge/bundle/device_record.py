@@ -93,7 +93,7 @@ class DeviceRecord:
             with self._alone():
                 known = self._read(file, kind)
                 yield known
-                write_whole(path, json.dumps(known, indent=1), durable=True)
+                write_whole(path, json.dumps(known, indent=1), durable=True, own=True)
         except OSError as error:
             raise SinkError(f"{path}: cannot be recorded: {error.strerror}") from None
 
@@ -142,8 +142,8 @@ class DeviceRecord:
 
     def _check_private(self, path: Path) -> None:
         """Raise BundleMismatchError if other users can write to the record."""
-        for each in (self.folder, path):
-            found = each.lstat()
+        # The folder may be a link of the user's.
+        for each, found in ((self.folder, self.folder.stat()), (path, path.lstat())):
             if untrusted(found):
                 raise BundleMismatchError(
                     f"{each}: expected files that only this user or root can write to, found mode "

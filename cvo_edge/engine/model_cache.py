@@ -31,7 +31,7 @@ from msgspec import Struct
 
 from cvo_edge.bundle.device_record import DeviceRecord
 from cvo_edge.errors import BundleMismatchError, SinkError
-from cvo_edge.files import own_folder, untrusted, write_whole
+from cvo_edge.files import OTHERS_WRITE, own_folder, untrusted, write_whole
 from cvo_edge.given import given_path
 
 GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
@@ -169,7 +169,7 @@ class ModelCache:
             return
         seen = [*_seen(cached), before][-_MOST_SEEN:]
         with contextlib.suppress(SinkError):
-            write_whole(cached.folder / SEEN_FILE, msgspec.json.encode(seen))
+            write_whole(cached.folder / SEEN_FILE, msgspec.json.encode(seen), own=True)
 
     def new_folder(self) -> Path | None:
         """Create a folder for the files of a new entry; None if that is impossible."""
@@ -188,6 +188,8 @@ class ModelCache:
         The new folder no longer exists afterwards, even on failure.
         """
         try:
+            for path in new.iterdir():
+                path.chmod(path.stat().st_mode & ~OTHERS_WRITE)
             entry = Entry(
                 name=name,
                 model_sha256=model_sha256,
@@ -197,7 +199,7 @@ class ModelCache:
                 weights_sha256=file_digests(new / WEIGHTS_FILE),
             )
             stated = msgspec.json.encode(entry)
-            (new / ENTRY_FILE).write_bytes(stated)
+            write_whole(new / ENTRY_FILE, stated, own=True)
             if self._seal is not None:
                 # An entry that was found without its seal is not used, and would be in the way.
                 self.forget(model_sha256)

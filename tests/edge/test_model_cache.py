@@ -360,6 +360,15 @@ def test_an_entry_that_others_may_write_to_is_made_anew(file, bundle_dir, bundle
     assert path.stat().st_mode & 0o022 == 0
 
 
+def test_a_permissive_umask_does_not_open_the_cache(bundle_dir, bundle, cache):
+    before = os.umask(0o002)
+    try:
+        read_bundle(bundle_dir, cache=cache)
+    finally:
+        os.umask(before)
+    assert cache.find(bundle.calibration.model.sha256) is not None
+
+
 def test_files_of_root_and_of_this_user_are_trusted_and_others_are_not(monkeypatch):
     monkeypatch.setattr("cvo_edge.files.os.geteuid", lambda: 1000)
 

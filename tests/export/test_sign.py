@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -239,6 +240,23 @@ def test_a_record_that_others_can_write_to_proves_nothing(copied_bundle, keys, s
             load(copied_bundle, public)
         path.chmod(before)
     load(copied_bundle, public)
+
+
+def test_a_record_is_private_whatever_the_umask_and_may_lie_behind_a_link(
+    copied_bundle, keys, tmp_path, monkeypatch
+):
+    secret, public = keys
+    sign(copied_bundle, secret, 7)
+    (tmp_path / "disk").mkdir(mode=0o755)
+    (tmp_path / "link").symlink_to(tmp_path / "disk")
+    monkeypatch.setenv("CVO_EDGE_STATE", str(tmp_path / "link"))
+    before = os.umask(0o002)
+    try:
+        load(copied_bundle, public)
+    finally:
+        os.umask(before)
+    load(copied_bundle, public)
+    assert (tmp_path / "disk" / "versions.json").is_file()
 
 
 def test_another_signed_bundle_in_the_same_folder_must_be_named(
