@@ -17,50 +17,14 @@ from cvo_edge.motion.messages import (
 )
 from cvo_edge.motion.records import MotionHeader
 from cvo_edge.output.mcap import McapFile, McapSink, recover
-from cvo_edge.output.messages import Placement, StoredImage
+from cvo_edge.output.messages import StoredImage
 from cvo_edge.output.opening import PLACED, open_sink
 from cvo_edge.output.records import Header, estimate_of, flat, read_records
 from cvo_edge.output.rerun import RerunSink
-from cvo_edge.pose import Pose
+from cvo_edge.programs.placing import Placing
 from cvo_edge.vocabulary import Format
 
 _ENCODINGS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}
-
-
-def pose_of(option: str, text: str | None) -> Pose | None:
-    """Read ``tx,ty,tz,qx,qy,qz,qw``; raises UsageError."""
-    if text is None:
-        return None
-    try:
-        return Pose.from_array([float(word) for word in text.split(",")])
-    except (ValueError, UsageError):
-        raise UsageError(
-            f"{option}: expected tx,ty,tz,qx,qy,qz,qw in metres and a quaternion, found {text}"
-        ) from None
-
-
-def placement_of(
-    header: Header,
-    base: str | None,
-    map: str | None,
-    frame_id: str | None,
-    child_frame_id: str | None,
-    unknown_variance: float | None,
-) -> Placement | None:
-    """Return what the options say, or None if they say nothing.
-
-    Raises UsageError for a pose that is none.
-    """
-    if all(each is None for each in (base, map, frame_id, child_frame_id, unknown_variance)):
-        return None
-    # A frame that is moved is no longer the bundle's: REP 105 has names for it.
-    return Placement(
-        frame_id or (header.frame_id if map is None else "map"),
-        child_frame_id or (header.child_frame_id if base is None else "base_link"),
-        pose_of("--base", base),
-        pose_of("--map", map),
-        unknown_variance,
-    )
 
 
 def convert(
@@ -68,23 +32,18 @@ def convert(
     output: str,
     format: Format,
     images: Path | None,
-    base: str | None,
-    map: str | None,
-    frame_id: str | None,
-    child_frame_id: str | None,
-    unknown_variance: float | None,
+    placing: Placing,
 ) -> int:
     """Write records to another format; returns their number. Raises CvoError."""
     of_motion = motion_header_of(source)
     if of_motion is not None:
-        if format != "mcap" or any(
-            each is not None for each in (images, base, map, unknown_variance)
-        ):
+        names = placing.frame_id, placing.child_frame_id
+        if format != "mcap" or images is not None or placing != Placing(None, None, *names, None):
             raise UsageError(
                 f"{source}: expected -o FILE.mcap with --frame-id and --child-frame-id alone for "
                 "records of motion"
             )
-        return _convert_motion(source, of_motion, output, frame_id, child_frame_id)
+        return _convert_motion(source, of_motion, output, *names)
     records = read_records(source)
     header = records.header
     if header is None:
@@ -92,7 +51,7 @@ def convert(
             f"{source}: expected records with a header, which says what their numbers mean, found "
             "none; records of older versions have to be made again"
         )
-    placement = placement_of(header, base, map, frame_id, child_frame_id, unknown_variance)
+    placement = placing.placement(header)
     if images is not None and format not in PLACED:
         raise UsageError(f"--images: expected the format {' or '.join(PLACED)}, found {format}")
     with (

@@ -1,4 +1,4 @@
-"""The command ``convert``, and the options that say in which frames other programs see a pose."""
+"""The command ``convert``: arguments and output only."""
 
 from __future__ import annotations
 
@@ -10,59 +10,15 @@ import typer
 from cvo_edge.errors import UsageError
 from cvo_edge.files import check_output
 from cvo_edge.process import say
-from cvo_edge.programs.options import ForceOption
+from cvo_edge.programs.options import (
+    BaseOption,
+    ChildFrameIdOption,
+    ForceOption,
+    FrameIdOption,
+    MapOption,
+    UnknownVarianceOption,
+)
 from cvo_edge.vocabulary import Format
-
-FRAMES = "Frames (mcap, rrd)"
-_POSE = "<tx,ty,tz,qx,qy,qz,qw>"
-
-BaseOption = Annotated[
-    str | None,
-    typer.Option(
-        "--base",
-        metavar=_POSE,
-        help="Pose of the robot's base in the camera (x right, y down, z forward): messages give "
-        "the base's pose.",
-        show_default=False,
-        rich_help_panel=FRAMES,
-    ),
-]
-MapOption = Annotated[
-    str | None,
-    typer.Option(
-        "--map",
-        metavar=_POSE,
-        help="Pose of the bundle's world in the map: messages give poses in the map.",
-        show_default=False,
-        rich_help_panel=FRAMES,
-    ),
-]
-FrameIdOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Name of the frame that poses are in; default: the bundle's, or map with --map.",
-        show_default=False,
-        rich_help_panel=FRAMES,
-    ),
-]
-ChildFrameIdOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Name of the frame whose pose is given; default: the bundle's, or base_link with "
-        "--base.",
-        show_default=False,
-        rich_help_panel=FRAMES,
-    ),
-]
-UnknownVarianceOption = Annotated[
-    float | None,
-    typer.Option(
-        help="Also give poses without bounds, with this variance (m^2, rad^2; 1 to 1e12). Default: "
-        "no pose.",
-        show_default=False,
-        rich_help_panel=FRAMES,
-    ),
-]
 
 
 def convert(
@@ -113,6 +69,7 @@ def convert(
     """Write records as a file of another program: ROS 2 messages (MCAP), rerun, CSV, TUM."""
     from cvo_edge.output.sinks import format_of
     from cvo_edge.programs import conversion
+    from cvo_edge.programs.placing import Placing
 
     if output is None:
         if format is None or format == "table":
@@ -120,14 +77,14 @@ def convert(
         output = str(source.with_suffix(f".{format}"))
     check_output(output, source, force=force)
     written_as = format_of(output, format)
-    frames = (base, map, frame_id, child_frame_id, unknown_variance)
+    placing = Placing(base, map, frame_id, child_frame_id, unknown_variance)
     if recover:
-        if written_as != "mcap" or images is not None or any(each is not None for each in frames):
+        if written_as != "mcap" or images is not None or placing.stated:
             raise UsageError(
                 "--recover: expected RECORDS.mcap and -o FILE.mcap without other options"
             )
         say(conversion.recovered(source, output))
         return
-    count = conversion.convert(source, output, written_as, images, *frames)
+    count = conversion.convert(source, output, written_as, images, placing)
     if output != "-":
         say(f"{count} records -> {output}")

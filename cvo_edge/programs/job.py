@@ -23,8 +23,8 @@ from cvo_edge.output.opening import PLACED, Writing, open_sink
 from cvo_edge.output.records import header_of
 from cvo_edge.output.rerun import RerunSink
 from cvo_edge.process import say
-from cvo_edge.programs.conversion import placement_of
 from cvo_edge.programs.options import model_cache
+from cvo_edge.programs.placing import Placing
 from cvo_edge.programs.run import RunSummary
 from cvo_edge.vocabulary import Existing, Format, Mode, Scope
 
@@ -35,10 +35,7 @@ Around = Callable[[str, Opening], AbstractContextManager[Writing]]
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """The options that both commands have; each means what its help says.
-
-    ``placing`` holds base, map, frame name, child frame name and unknown variance.
-    """
+    """The options that both commands have; each means what its help says."""
 
     bundle: Path
     source: str
@@ -58,7 +55,7 @@ class Wanted:
     state: Path | None
     mavlink: str | None
     metrics: int | None
-    placing: tuple[str | None, str | None, str | None, str | None, float | None]
+    placing: Placing
     fps: float | None = None
     stamps: str | None = None
     follow: bool = False
@@ -151,9 +148,8 @@ def _openings(
         wanted.scope,
         stamps="fps" if wanted.fps else "arrival" if frames.live else None,
     )
-    placed = placement_of(header, *wanted.placing)
-    base, map_pose, *_ = wanted.placing
-    if wanted.mavlink is not None and (base is None or map_pose is None):
+    placed = wanted.placing.placement(header)
+    if wanted.mavlink is not None and None in (wanted.placing.base, wanted.placing.map):
         raise UsageError(
             "--mavlink: expected --map, the bundle's world in north, east, down, and --base, "
             "the vehicle's forward, right, down in the camera"
@@ -161,6 +157,8 @@ def _openings(
     if wanted.view:
         where = placed or Placement.of(header)
         yield "viewer", partial(RerunSink, None, header, where, lambda: odometer.image)
+    # The options may be for the autopilot or the viewer alone; for neither, they are refused.
+    for_records = wanted.format in PLACED or not (wanted.mavlink or wanted.view)
     yield (
         "records",
         partial(
@@ -168,7 +166,7 @@ def _openings(
             wanted.output,
             wanted.format,
             header,
-            placed if wanted.format in PLACED or not (wanted.mavlink or wanted.view) else None,
+            placed if for_records else None,
             region=wanted.region,
             existing=wanted.existing,
             told=say,

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 INTERVALS, RUNTIME, REPORT = "Intervals", "Runtime", "Output"
 ADAPTATION = "Adaptation"
+FRAMES = "Frames (mcap, rrd)"
+_POSE = "<tx,ty,tz,qx,qy,qz,qw>"
 # A thousand years of a camera.
 MOST_FRAMES = 10**12
 # An odometer keeps 1,024 frames for their labels.
@@ -258,6 +260,53 @@ MetricsOption = Annotated[
         help="Also serve figures for Prometheus on this port of the loopback interface.",
         show_default=False,
         rich_help_panel=REPORT,
+    ),
+]
+BaseOption = Annotated[
+    str | None,
+    typer.Option(
+        "--base",
+        metavar=_POSE,
+        help="Pose of the robot's base in the camera (x right, y down, z forward): messages give "
+        "the base's pose.",
+        show_default=False,
+        rich_help_panel=FRAMES,
+    ),
+]
+MapOption = Annotated[
+    str | None,
+    typer.Option(
+        "--map",
+        metavar=_POSE,
+        help="Pose of the bundle's world in the map: messages give poses in the map.",
+        show_default=False,
+        rich_help_panel=FRAMES,
+    ),
+]
+FrameIdOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Name of the frame that poses are in; default: the bundle's, or map with --map.",
+        show_default=False,
+        rich_help_panel=FRAMES,
+    ),
+]
+ChildFrameIdOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Name of the frame whose pose is given; default: the bundle's, or base_link with "
+        "--base.",
+        show_default=False,
+        rich_help_panel=FRAMES,
+    ),
+]
+UnknownVarianceOption = Annotated[
+    float | None,
+    typer.Option(
+        help="Also give poses without bounds, with this variance (m^2, rad^2; 1 to 1e12). Default: "
+        "no pose.",
+        show_default=False,
+        rich_help_panel=FRAMES,
     ),
 ]
 SourceArgument = Annotated[

@@ -9,27 +9,24 @@ import typer
 from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.files import check_output
 from cvo_edge.process import say
-from cvo_edge.programs.convert import (
-    BaseOption,
-    ChildFrameIdOption,
-    FrameIdOption,
-    MapOption,
-    UnknownVarianceOption,
-)
 from cvo_edge.programs.options import (
     REPORT,
     AppendOption,
+    BaseOption,
     BitDepthOption,
     BundleArgument,
     CacheOption,
     CameraOption,
+    ChildFrameIdOption,
     ExpectMotionOption,
     FollowOption,
     ForceOption,
     FormatOption,
+    FrameIdOption,
     GroundTruthOption,
     LabelDelayOption,
     LabelsOption,
+    MapOption,
     MavlinkOption,
     MaxFramesOption,
     MetricsOption,
@@ -45,6 +42,7 @@ from cvo_edge.programs.options import (
     StateOption,
     ThreadsOption,
     TimeoutOption,
+    UnknownVarianceOption,
     existing_file,
 )
 
@@ -114,6 +112,7 @@ def run(
     from cvo_edge.output.sinks import format_of
     from cvo_edge.programs.job import Wanted, opened
     from cvo_edge.programs.labels import Labels
+    from cvo_edge.programs.placing import Placing
     from cvo_edge.programs.preview import frames_preview
     from cvo_edge.programs.progress import frames_progress
     from cvo_edge.programs.run import run as run_frames
@@ -146,7 +145,7 @@ def run(
         metrics=metrics,
         view=view,
         bit_depth=bit_depth,
-        placing=(base, map, frame_id, child_frame_id, unknown_variance),
+        placing=Placing(base, map, frame_id, child_frame_id, unknown_variance),
     )
     read = (source, bundle, public_key, camera, state, stamps)
     named = (*named_files(ground_truth), *named_files(labels))

@@ -15,21 +15,18 @@ import typer
 from cvo_edge.errors import UsageError
 from cvo_edge.files import check_output
 from cvo_edge.process import Terminated, clean_up_within, say
-from cvo_edge.programs.convert import (
-    BaseOption,
-    ChildFrameIdOption,
-    FrameIdOption,
-    MapOption,
-    UnknownVarianceOption,
-)
 from cvo_edge.programs.options import (
     REPORT,
+    BaseOption,
     BundleArgument,
     CacheOption,
     CameraOption,
+    ChildFrameIdOption,
     ExpectMotionOption,
     FollowOption,
     FormatOption,
+    FrameIdOption,
+    MapOption,
     MavlinkOption,
     MetricsOption,
     ModeOption,
@@ -43,6 +40,7 @@ from cvo_edge.programs.options import (
     StateOption,
     ThreadsOption,
     TimeoutOption,
+    UnknownVarianceOption,
 )
 
 if TYPE_CHECKING:
@@ -95,6 +93,7 @@ def serve(
     from cvo_edge.output.sinks import format_of
     from cvo_edge.programs.job import Wanted, opened
     from cvo_edge.programs.notify import Notifier
+    from cvo_edge.programs.placing import Placing
     from cvo_edge.programs.run import run as run_frames
     from cvo_edge.programs.service import Service
 
@@ -123,7 +122,7 @@ def serve(
         state=state,
         mavlink=mavlink,
         metrics=metrics,
-        placing=(base, map, frame_id, child_frame_id, unknown_variance),
+        placing=Placing(base, map, frame_id, child_frame_id, unknown_variance),
     )
     check_output(output, source, bundle, public_key, camera, state, force=None)
     notifier = Notifier()

@@ -17,7 +17,7 @@ from cvo_edge.input.ros_images import lens_of, message_image, pinhole_of
 from cvo_edge.odometer import Odometer
 from cvo_edge.output.messages import TRANSFORM, Message, Placement, ros_messages
 from cvo_edge.output.records import header_of
-from cvo_edge.programs.conversion import placement_of
+from cvo_edge.programs.placing import Placing
 from cvo_edge.vocabulary import Scope
 
 # Parameters of the node and their defaults; an empty text and a zero stand for none.
@@ -160,19 +160,19 @@ def answers(
     ) as odometer:
         calibration = odometer.calibration
         header = header_of(calibration, odometer.chart, odometer.confidence, settings.scope)
-        placement = placement_of(
-            header,
+        placing = Placing(
             settings.base or None,
             settings.map or None,
             settings.frame_id or None,
             settings.child_frame_id or None,
             settings.unknown_variance or None,
         )
+        placement = placing.placement(header) or Placement.of(header)
         frames = (frame_of(message, dropped, now_ns()) for message, dropped in arrivals)
         moving = True if settings.always_moving else None
         before = None
         for estimate in odometer.stream(frames, moving=moving):
-            found = list(ros_messages(estimate, placement or Placement.of(header), header))
+            found = list(ros_messages(estimate, placement, header))
             if not settings.publish_tf:
                 found = [each for each in found if each.type != TRANSFORM]
             said = estimate.status, estimate.reasons
