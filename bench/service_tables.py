@@ -37,6 +37,23 @@ def day_account() -> str:
     return table((*head, "records read back", "losses unsaid"), rows)
 
 
+def day_checks() -> str:
+    """Return what was checked beside the accounts."""
+    found = read_result("service", "day")
+    ages, watchdog = found["ages"], found["watchdog"]
+    rows = [
+        ["frames of the first connection, in which the process is stopped", str(ages["frames"])],
+        ["of them older than 1.1 s when their estimate was given", str(ages["older than 1.1 s"])],
+        ["of those with status `ok`", str(ages["older and ok"])],
+        [
+            "longest time between two `WATCHDOG=1` while the process was not stopped",
+            f"{watchdog['longest_s']:.1f} s of {watchdog['limit_s']:.0f} s",
+        ],
+        ["exit codes", " ".join(map(str, found["exit_codes"]))],
+    ]
+    return table(("what", "found"), rows)
+
+
 def four_cameras() -> str:
     """Return a row for each way to serve four cameras, and each bundle."""
     found = read_result("service", "four_cameras")
@@ -64,5 +81,6 @@ def four_cameras() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "day": day,
     "day account": day_account,
+    "day checks": day_checks,
     "four cameras": four_cameras,
 }
