@@ -25,6 +25,10 @@ SAMPLE_STEP = 8
 _BLACK, _SATURATED, _FLAT = 20, 250, 4.0
 # Share of bright pixels tolerated in a black image: hot pixels, or a time overlay.
 _FEW = 0.02
+# A black image is at most so bright, a saturated one at least: half of it is saturated. One grey
+# level of slack is for rounding.
+_BLACK_MEAN = _BLACK + _FEW * (255 - _BLACK) + 1
+_SATURATED_MEAN = _SATURATED / 2 - 1
 # An older frame says where the camera was, not where it is.
 _STALE_MS = 1000.0
 # 64 bits hold nanoseconds from 1970 up to the year 2262.
@@ -35,25 +39,28 @@ class Look:
     """What the checks need of an image. Take it before inference empties the processor's caches.
 
     From the model's input ``tensor``, (1, height, width, 3) uint8 RGB. ``size``: (height, width) of
-    the original image; ``sample``: some pixels of the tensor, (n, 3); ``digest``: what is compared
-    with other frames.
+    the original image; ``sample``: some pixels of the tensor, (n, 3); ``means``, ``deviations``:
+    theirs by channel; ``digest``: what is compared with other frames.
     """
 
     def __init__(self, tensor: Image8, size: tuple[int, int]) -> None:
         self.size, self.digest = size, Digest.of(tensor)
         half = SAMPLE_STEP // 2
         self.sample: Image8 = tensor[0, half::SAMPLE_STEP, half::SAMPLE_STEP].reshape(-1, 3)
+        means, deviations = cv2.meanStdDev(self.sample[:, np.newaxis])
+        self.means: list[float] = means.ravel().tolist()
+        self.deviations: list[float] = deviations.ravel().tolist()
 
 
 def image_doubt(look: Look) -> Reason | None:
     """Return why an image is rejected (black, saturated or without contrast), or None."""
-    sample = look.sample
-    if np.count_nonzero(sample > _BLACK) <= _FEW * sample.size:
+    sample, mean = look.sample, sum(look.means) / len(look.means)
+    # Most images are neither dark nor bright enough for the counts to matter.
+    if mean <= _BLACK_MEAN and np.count_nonzero(sample > _BLACK) <= _FEW * sample.size:
         return Reason.IMAGE_BLACK
-    if 2 * np.count_nonzero(sample >= _SATURATED) > sample.size:
+    if mean >= _SATURATED_MEAN and 2 * np.count_nonzero(sample >= _SATURATED) > sample.size:
         return Reason.IMAGE_SATURATED
-    _, deviation = cv2.meanStdDev(sample[:, np.newaxis])
-    return Reason.IMAGE_FLAT if deviation.max() <= _FLAT else None
+    return Reason.IMAGE_FLAT if max(look.deviations) <= _FLAT else None
 
 
 class StreamChecks:

@@ -19,6 +19,8 @@ from cvo_edge.record import Reason
 # a grey scene that was encoded stays below. An image has colour if this share of its pixels has:
 # one of a dark room has more, one with a coloured clock over it less.
 _CHROMA, _FEW = 8, 0.02
+# The mean chroma of an image of which just that share has colour; one grey level of slack.
+_CHROMA_MEAN = _CHROMA + _FEW * (255 - _CHROMA) + 1
 # Images may be enlarged a little more than those of the calibration: sizes are whole pixels.
 _ENLARGED = 1.02
 # Resized images have whole rows and columns; some tools round these to even numbers.
@@ -85,6 +87,9 @@ class StreamSizes:
 
 def has_colour(look: Look) -> bool:
     """Whether more than a few pixels of the model's input have colour."""
+    # So different means take more than a few pixels; usually, this saves the counting.
+    if max(look.means) - min(look.means) > _CHROMA_MEAN:
+        return True
     red, green, blue = look.sample.T
     highest = np.maximum(np.maximum(red, green), blue)
     chroma: NDArray[np.uint8] = highest - np.minimum(np.minimum(red, green), blue)

@@ -103,6 +103,7 @@ class Repetition:
 
     def __init__(self) -> None:
         self._hashes = _Newest(_ROWS * _COLUMNS, np.dtype(np.uint64))
+        self._numbers = _Seen()
         # The last column is the squared length of the others.
         self._thumbnails = _Newest(_THUMBNAIL[0] * _THUMBNAIL[1] + 1, np.dtype(np.float32))
         # Squared distances to earlier frames, of the last frames in which the picture moved.
@@ -124,7 +125,9 @@ class Repetition:
             Whether the camera moves; None if that is unknown.
         """
         hashes, cells, thumbnail = digest
-        repeated = fresh_noise and self._equal(hashes, cells)
+        # Usually none of the numbers was seen before, and a set is the fastest way to find out.
+        seen = self._numbers.add(hashes.tolist())
+        repeated = seen and fresh_noise and self._equal(hashes, cells)
         squares = self._squared_distances(thumbnail)
         looped = self._loops(squares, thumbnail) and moving is not False
         still = moving is True and _still(squares)
@@ -133,12 +136,8 @@ class Repetition:
         return (Reason.FRAME_REPEATED,) * (repeated or looped) + (Reason.PICTURE_STILL,) * still
 
     def _equal(self, hashes: NDArray[np.uint64], cells: Numbers) -> bool:
-        equal = self._hashes.rows == hashes
-        # The usual case, and the fastest of numpy's ways to find out.
-        if np.count_nonzero(equal) == 0:
-            return False
         textured = _textured(cells)
-        found = int(np.count_nonzero(equal.any(axis=0) & textured))
+        found = int(np.count_nonzero((self._hashes.rows == hashes).any(axis=0) & textured))
         return found > 0 and found >= _EQUAL_SHARE * int(np.count_nonzero(textured))
 
     def _squared_distances(self, thumbnail: Numbers) -> Numbers:
@@ -187,6 +186,24 @@ def _is_loop(total: Numbers, moved: float, near: float) -> bool:
     same_place = abs(total[nearest - 1] - moved) < _SAME * moved
     oscillates = total[1 - _SHORTEST_LOOP : -1].min() < _NEARER**2 * moved
     return bool(total[nearest] < near and same_place and not oscillates)
+
+
+class _Seen:
+    """The numbers of at least the newest ``FRAMES`` frames, and of fewer than twice as many."""
+
+    def __init__(self) -> None:
+        self._newer: set[int] = set()
+        self._older: set[int] = set()
+        self._frames = 0
+
+    def add(self, numbers: list[int]) -> bool:
+        """Store the numbers of a frame; tell whether any of them was there before."""
+        seen = not (self._newer.isdisjoint(numbers) and self._older.isdisjoint(numbers))
+        if self._frames == FRAMES:
+            self._older, self._newer, self._frames = self._newer, set(), 0
+        self._newer.update(numbers)
+        self._frames += 1
+        return seen
 
 
 class _Newest:
