@@ -237,8 +237,7 @@ def _check(file: MotionFile) -> None:
             raise CalibrationFileError(f"{where}: shape: expected a positive definite matrix")
         _check_thresholds(where, spec.thresholds, len(COLUMNS))
         _check_counts(where, file.groups, spec.recordings, spec.motions)
-        # Without a scale, the first three mean nothing.
-        _check_supported(where, spec.thresholds, spec.recordings, 3 if pointed else 0)
+        _check_supported(where, spec.thresholds, spec.recordings, pointed=pointed)
         _check_all_six(where, spec)
     quaternion = file.correction.q_xyzw
     if quaternion is not None and abs(sum(each**2 for each in quaternion) - 1.0) > 1e-6:
@@ -324,18 +323,22 @@ def _check_supported(
     where: str,
     thresholds: Sequence[ThresholdSpec | TubeThresholdSpec],
     count: int,
-    meaningless: int = 0,
+    *,
+    pointed: bool = False,
 ) -> None:
     """Check that thresholds are finite exactly if the drives allow it, and grow by the rules.
 
-    Those of the first ``meaningless`` columns are null.
+    Where only directions are known, the first three columns mean nothing, and that of the position
+    is the direction's: not all drives have one.
     """
     least: dict[tuple[float, int], tuple[str, float]] = {}
     for rule in ("mean", "tolerance", "capped", "hierarchical"):
         for entry in (each for each in thresholds if each.rule == rule):
             finite = is_supported(rule, entry.confidence, count)
             for column, value in enumerate(entry.q):
-                if (value is not None) != (finite and column >= meaningless):
+                if pointed and value is None and column == COLUMNS.index("position"):
+                    continue
+                if (value is not None) != (finite and not (pointed and column < 3)):
                     raise CalibrationFileError(
                         f"{where}: expected {'a number' if finite else 'null'} for {rule} at "
                         f"{entry.confidence:g} from {count} drives, found {shown(value)} at "
