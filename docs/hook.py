@@ -22,6 +22,7 @@ PAGES = {
     "calibration_artifacts/README.md": "demonstration-bundles.md",
     "bench/results/README.md": "result-files.md",
     "deploy/README.md": "deploy.md",
+    "ros/README.md": "ros.md",
 }
 COPIES = "repository"
 _LINK = re.compile(r"(\]\()([^)#\s]+)((?:#[^)\s]*)?\))")

@@ -34,7 +34,7 @@ PARAMETERS: dict[str, str | float | bool] = {
     "child_frame_id": "",
     "unknown_variance": 0.0,
     "publish_tf": False,
-    "always_moving": False,
+    "expect_motion": False,
 }
 NO_CAMERA_INFO = "none"
 
@@ -54,7 +54,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     child_frame_id: str
     unknown_variance: float
     publish_tf: bool
-    always_moving: bool
+    expect_motion: bool
 
     @property
     def compressed(self) -> bool:
@@ -169,7 +169,7 @@ def answers(
         )
         placement = placing.placement(header) or Placement.of(header)
         frames = (frame_of(message, dropped, now_ns()) for message, dropped in arrivals)
-        moving = True if settings.always_moving else None
+        moving = True if settings.expect_motion else None
         before = None
         for estimate in odometer.stream(frames, moving=moving):
             found = list(ros_messages(estimate, placement, header))
