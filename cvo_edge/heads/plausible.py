@@ -71,6 +71,8 @@ def check_plausible(calibration: Calibration, head: Head) -> None:
     """Raise CalibrationFileError, naming the key, if the numbers contradict each other."""
     entries = (*calibration.thresholds, *table_entries(calibration))
     _check_counts(calibration.calibration)
+    # The stored ones were checked when the file was read.
+    head.check(entries, calibration.calibration.joint)
     for entry in entries:
         _check_bounded(entry, calibration.calibration, head)
     _check_ranks(entries, calibration.calibration, head)

@@ -245,6 +245,15 @@ def test_another_number_of_frames_does_not_fit_the_ranks(artifacts_dir, n):
     assert {entry.scope for entry in table_entries(calibration)} == set(SCOPES)
 
 
+def test_factors_below_zero_are_refused_at_any_confidence(artifacts_dir):
+    scores = np.random.default_rng(1).gamma(2.0, 1.0, (150, 1, 6))
+    calibration, _, head = made(demonstration(artifacts_dir, "cjp"), scores, np.arange(150))
+    table = altered(calibration.quantiles, "marginal", lambda place, q: q if place else -1.0)
+    lie = decode_calibration(encode_calibration(replace(calibration, quantiles=table)))
+    with pytest.raises(CalibrationFileError, match="expected factors of at least 0 for normalised"):
+        check_plausible(lie, head)
+
+
 def test_a_bundle_without_room_stays_as_it_was(artifacts_dir, monkeypatch):
     scores = np.random.default_rng(1).gamma(2.0, 1.0, (150, 1, 6))
     monkeypatch.setattr("cvo_edge.bundle.reading.MAX_CALIBRATION_BYTES", 9000)
