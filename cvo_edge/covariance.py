@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import math
 from statistics import NormalDist
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +40,6 @@ from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import Scope
 
 Array = NDArray[np.float64]
-CovarianceFrame = Literal["world", "chart"]
 
 _SIX = 6
 _NEWTON_STEPS = 50

@@ -8,7 +8,6 @@ from contextlib import closing
 from functools import partial
 from threading import Lock
 from time import perf_counter
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -195,12 +194,7 @@ class Odometer(Labelled):
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close it."""
         self.close()
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import select
-import stat
 import sys
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from cvo_edge.errors import SinkError
 from cvo_edge.files import check_output
-from cvo_edge.output.named import Told, has_name, lock, lost, reopenings
+from cvo_edge.output.named import Told, has_name, is_regular, lock, lost, reopenings
 from cvo_edge.vocabulary import Existing
 
 _BLOCK = 4096
@@ -71,12 +69,7 @@ class LineFile:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file, if it is one."""
         if self._owned:
             os.close(self._descriptor)
@@ -86,8 +79,8 @@ class LineFile:
         """Whether the file has a beginning; one that was emptied or opened again may have none."""
         self._open_again()
         if self._owned and self._started:
-            found = os.fstat(self._descriptor)
-            self._started = found.st_size > 0 or not stat.S_ISREG(found.st_mode)
+            size = os.fstat(self._descriptor).st_size
+            self._started = size > 0 or not is_regular(self._descriptor)
         return self._started
 
     def write(self, line: bytes) -> None:
@@ -123,7 +116,7 @@ class LineFile:
 
         A second writer is locked out.
         """
-        if not self._owned or not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
+        if not self._owned or not is_regular(self._descriptor):
             return
         end = 0
         if self._existing == "append":
@@ -152,12 +145,11 @@ class LineFile:
 
     def _take_back(self, written: int) -> None:
         """Remove an incomplete line from a regular file."""
-        found = os.fstat(self._descriptor)
-        if not written or not stat.S_ISREG(found.st_mode):
+        if not written or not is_regular(self._descriptor):
             return
         end = os.lseek(self._descriptor, 0, os.SEEK_CUR)
         # Truncate only if nothing follows the incomplete line.
-        if end == found.st_size:
+        if end == os.fstat(self._descriptor).st_size:
             os.ftruncate(self._descriptor, end - written)
             os.lseek(self._descriptor, end - written, os.SEEK_SET)
 

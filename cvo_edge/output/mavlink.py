@@ -12,7 +12,6 @@ M^-1 Sigma M^-T with the axes M = [Rz Ry ex, Rz ey, ez] that they turn about.
 from __future__ import annotations
 
 import math
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -87,12 +86,7 @@ class MavlinkSink:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the link."""
         self._link.close()
 

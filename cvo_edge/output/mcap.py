@@ -12,7 +12,6 @@ import struct
 from collections.abc import Mapping
 from io import BufferedReader, RawIOBase
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -80,12 +79,7 @@ class McapFile:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Finish the file: its index makes it complete for every reader."""
         if self._stream is None:
             return
@@ -229,12 +223,7 @@ class McapSink:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Finish the file."""
         if self._file is not None:
             self._file.__exit__(kind, error, traceback)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from types import TracebackType
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,39 +69,24 @@ class MetricsSink:
             ) from None
         # A registry of its own: that of the library is one for the whole process.
         registry = kinds.CollectorRegistry()
-        self._frames = kinds.Counter(
-            "cvo_frames", "Frames by status.", ["status"], registry=registry
-        )
+        counter = partial(kinds.Counter, registry=registry)
+        gauge = partial(kinds.Gauge, registry=registry)
+        self._frames = counter("cvo_frames", "Frames by status.", ["status"])
         for status in Status:
             self._frames.labels(status.value)
-        self._dropped = kinds.Counter(
-            "cvo_dropped_frames", "Frames dropped for newer ones.", registry=registry
-        )
+        self._dropped = counter("cvo_dropped_frames", "Frames dropped for newer ones.")
         self._next_seq = 0
-        self._reasons = kinds.Counter(
-            "cvo_reasons", "Remarks on frames.", ["reason"], registry=registry
-        )
-        self._unbounded = kinds.Counter(
-            "cvo_unbounded_frames", "Frames without finite bounds.", registry=registry
-        )
+        self._reasons = counter("cvo_reasons", "Remarks on frames.", ["reason"])
+        self._unbounded = counter("cvo_unbounded_frames", "Frames without finite bounds.")
         self._latency = kinds.Histogram(
             "cvo_latency_seconds",
             "From a frame's arrival to its interval.",
             buckets=_BUCKETS_S,
             registry=registry,
         )
-        self._width = kinds.Gauge(
-            "cvo_width",
-            "Width of the last finite interval, m or rad.",
-            ["dof"],
-            registry=registry,
-        )
-        self._alarm = kinds.Gauge(
-            "cvo_drift_alarm", "1 during an alarm, 0 when clear.", registry=registry
-        )
-        self._stamp = kinds.Gauge(
-            "cvo_last_stamp_seconds", "Stamp of the last frame.", registry=registry
-        )
+        self._width = gauge("cvo_width", "Width of the last finite interval, m or rad.", ["dof"])
+        self._alarm = gauge("cvo_drift_alarm", "1 during an alarm, 0 when clear.")
+        self._stamp = gauge("cvo_last_stamp_seconds", "Stamp of the last frame.")
         if counts is not None:
             registry.register(_Asked(core, counts))
         try:
@@ -116,12 +101,7 @@ class MetricsSink:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop serving."""
         self._server.shutdown()
         self._server.server_close()

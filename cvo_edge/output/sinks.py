@@ -6,7 +6,6 @@ import csv
 import io
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import TracebackType
 
 import msgspec
 import numpy as np
@@ -94,14 +93,9 @@ class Sink:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file, if it is one."""
-        self._lines.__exit__(kind, error, traceback)
+        self._lines.__exit__()
 
     def write(self, estimate: PoseInterval) -> None:
         """Write one estimate.

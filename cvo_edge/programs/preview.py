@@ -70,8 +70,8 @@ class Preview:
         from rich.text import Text
 
         shown = Text(no_wrap=True, overflow="ellipsis")
-        style = _STYLES[estimate.status] if estimate.vouched else _STYLES[Status.DEGRADED]
-        style = _STYLES[Status.INVALID] if estimate.status is Status.INVALID else style
+        unbounded = estimate.status is Status.OK and not estimate.vouched
+        style = _STYLES[Status.DEGRADED if unbounded else estimate.status]
         shown.append(f"{estimate.status.upper():<9}", style=f"bold {style}")
         shown.append(f" {_cut(self._progress(now), _WIDTH - 10)}\n")
         shown.append(f"{_cut(_frame_line(estimate), _WIDTH)}\n")
