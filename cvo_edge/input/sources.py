@@ -93,8 +93,7 @@ def open_source(
         with ``fps``, for a camera, or as ``names`` for a video, or ``follow`` for anything but a
         folder.
     """
-    text = without_stdin(given_source(source))
-    bits = checked_bits(bit_depth)
+    text, bits = without_stdin(given_source(source)), checked_bits(bit_depth)
     # What is waited for is a camera.
     live = live or patience is not None
     fps = None if fps is None else given_number(fps, "fps")
@@ -115,39 +114,42 @@ def open_source(
         _check_followed(path, stamps)
         return FollowedFolder(path, fps, quiet_s, live=live, patience=patience, bits=bits)
     if path.is_dir():
-        return ImageFiles(
-            images_in(path), fps, f"{shown(text)}: expected images, found none", stamps, bits
-        )
+        none = f"{shown(text)}: expected images, found none"
+        return ImageFiles(images_in(path), fps, none, stamps, bits)
     if re.search(r"file\b", text.partition("://")[0], re.IGNORECASE) and "://" in text:
         raise SourceError(f"{shown(text)}: expected a file's path, found a file address")
     if names_pipe(text) and not (live and names_fifo(text)):
         return piped_source(text, fps, timeout_s, _listed(stamps), threads, live=live)
     if names_camera(text) or names_pipe(text):
-        if stamps is not None:
-            raise UsageError(
-                f"stamps: expected images or a video, whose stamps they are, found {shown(text)}, "
-                "whose frames are stamped as they arrive"
-            )
+        _check_arriving(text, stamps)
         device = int(text) if text.isdecimal() else text
         reader = partial(Capture, threads=threads)
         return Camera(device, fps, timeout_s, reader=reader, patience=patience)
-    if path.is_file():
-        if path.suffix.lower() in IMAGE_SUFFIXES or is_one_image(path):
-            return ImageFiles(Listing("", [text], {}), fps, "", stamps, bits)
+    if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES and not is_one_image(path):
         return Video(path, fps, timeout_s, _listed(stamps), threads)
+    none = f"{shown(text)}: expected images, found no match"
+    return ImageFiles(_named_images(text), fps, none, stamps, bits)
+
+
+def _named_images(text: str) -> Listing:
+    """Return the image of a name, or the images of a glob; raises SourceError for neither."""
+    if Path(text).is_file():
+        return Listing("", [text], {})
     if glob.has_magic(text):
-        found = [name for name in glob.iglob(text, recursive=True) if not os.path.isdir(name)]  # noqa: PTH112
-        return ImageFiles(
-            colour_images(found),
-            fps,
-            f"{shown(text)}: expected images, found no match",
-            stamps,
-            bits,
-        )
+        found = glob.iglob(text, recursive=True)
+        return colour_images([name for name in found if not os.path.isdir(name)])  # noqa: PTH112
     raise SourceError(
         f"{shown(text)}: not found; expected a folder, glob, video file, camera index, device or "
         "address"
     )
+
+
+def _check_arriving(text: str, stamps: str | None) -> None:
+    if stamps is not None:
+        raise UsageError(
+            f"stamps: expected images or a video, whose stamps they are, found {shown(text)}, "
+            "whose frames are stamped as they arrive"
+        )
 
 
 def _check_followed(path: Path, stamps: str | None) -> None:

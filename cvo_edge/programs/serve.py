@@ -6,7 +6,7 @@ import faulthandler
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,8 +45,6 @@ from cvo_edge.programs.options import (
 
 if TYPE_CHECKING:
     from cvo_edge.input.frame import Source
-    from cvo_edge.output.opening import Writing
-    from cvo_edge.programs.job import Opening
     from cvo_edge.programs.notify import Notifier
     from cvo_edge.programs.service import Service
 
@@ -89,7 +87,6 @@ def serve(
     """Estimate a camera's frames as a service: outlives a lost camera and a full disk."""
     from cvo_edge.engine.selftest import check_selftest
     from cvo_edge.input.waiting import Waiting
-    from cvo_edge.output.dropping import Dropping
     from cvo_edge.output.sinks import format_of
     from cvo_edge.programs.job import Wanted, opened
     from cvo_edge.programs.notify import Notifier
@@ -134,16 +131,10 @@ def serve(
     waiting = Waiting(told)
     service = Service(waiting, notifier, told, health_every)
 
-    def around(what: str, opening: Opening) -> AbstractContextManager[Writing]:
-        if what == "metrics":
-            return opening()
-        service.sinks.append(Dropping(what, opening, told))
-        return service.sinks[-1]
-
     if sys.stderr is not None:
         # A watchdog's SIGABRT then says where each thread was.
         faulthandler.enable(sys.stderr)
-    with opened(wanted, patience=waiting, around=around, counts=service.counts) as job:
+    with opened(wanted, patience=waiting, around=service.around, counts=service.counts) as job:
         check_selftest(job.odometer)
         try:
             with _signals(job.frames, service, notifier):

@@ -139,7 +139,9 @@ def test_only_a_folder_is_followed(tmp_path, name, options, error, said):
 def test_a_signal_ends_the_command_with_every_record(bundle_dir, clip_dir, tmp_path):
     images = [path.read_bytes() for path in sorted(clip_dir.glob("*.color.jpg"))[:2]]
     put(tmp_path, "0.jpg", images[0])()
-    arguments = [sys.executable, "-m", "cvo_edge", "run", bundle_dir, tmp_path, "--follow"]
+    # A record that does not come ends the command, and fails the test.
+    options = ["--follow", "--timeout", "60"]
+    arguments = [sys.executable, "-m", "cvo_edge", "run", bundle_dir, tmp_path, *options]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
         assert b'"header"' in process.stdout.readline()
         assert b'"0.jpg"' in process.stdout.readline()
