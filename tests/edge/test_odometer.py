@@ -175,7 +175,7 @@ def test_a_forked_process_loads_its_own(bundle_dir, clip_dir, what, code):
 def test_a_path_is_no_stream(bundle_dir, clip_dir):
     with Odometer.load(bundle_dir) as odometer:
         for path in (clip_dir, str(clip_dir)):
-            with pytest.raises(UsageError, match=r"use odometer\.stream\(open_source\(path\)\)"):
+            with pytest.raises(UsageError, match=r"a path is opened by open_source\(path\)"):
                 next(odometer.stream(path))
 
 
