@@ -91,7 +91,7 @@ class Spoken(NamedTuple):
 
 
 def spoken(estimate: PoseInterval, placement: Placement) -> Spoken | None:
-    """Return the pose that a message may give, as the table above says, or None."""
+    """Return the pose that a message may give, by the table of this module, or None."""
     if estimate.status is Status.INVALID or estimate.pose is None:
         return None
     base, outer = placement.T_camera_base, placement.T_map_world

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from cvo_edge.errors import UsageError, printable
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.overlay import TO_CM_OR_DEG, round_up
+from cvo_edge.programs.progress import done_text
 from cvo_edge.programs.run import RunSummary
 from cvo_edge.record import Status
 
@@ -84,11 +85,8 @@ class Preview:
         return shown
 
     def _progress(self, now: float) -> str:
-        done = self._summary.frames
-        rate = done / max(now - self._begin, 1e-9)
-        of_all = "" if self._total is None else f" of {self._total}"
         level = f"{self._summary.confidence:g} {self._summary.scope}"
-        return f"{done}{of_all} frames  {rate:.1f} fps  {level}"
+        return f"{done_text(self._summary, self._total, now - self._begin)}  {level}"
 
 
 def _frame_line(estimate: PoseInterval) -> str:
@@ -137,7 +135,7 @@ def _cut(text: str, room: int) -> str:
 
 @contextmanager
 def frames_preview(
-    summary: RunSummary, length: int | None, *, records_here: bool
+    summary: RunSummary, total: int | None, *, records_here: bool
 ) -> Iterator[Callable[[PoseInterval], None]]:
     """Yield a function to call with each frame; it does nothing if stderr is not a terminal.
 
@@ -160,7 +158,7 @@ def frames_preview(
     )
     try:
         live.start()
-        yield Preview(live, summary, length).tick
+        yield Preview(live, summary, total).tick
     finally:
         with suppress(OSError, ValueError):
             live.stop()

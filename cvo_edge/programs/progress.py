@@ -52,6 +52,18 @@ class _Line:
             self._next = float("inf")
 
 
+def done_text(summary: RunSummary, total: int | None, seconds: float) -> str:
+    """Return the frames done so far, their rate and, with a total, the share and the time left."""
+    done = summary.frames + summary.dropped
+    parts = [f"{done} frames", f"{summary.frames / max(seconds, 1e-9):.1f} fps"]
+    if total is not None:
+        # A header may announce fewer frames than the file holds.
+        parts[0] = f"{done} of {total} frames ({done / max(1, done, total):.0%})"
+        if done:
+            parts.append(f"{_minutes(max(0, total - done) * seconds / done)} left")
+    return "  ".join(parts)
+
+
 class FramesProgress(_Line):
     """Progress of a stream: frames, rate, time left and statuses; most calls return quickly.
 
@@ -85,19 +97,9 @@ class FramesProgress(_Line):
 
     def line(self, now: float) -> str:
         """Return the text at the time ``now``."""
-        summary = self._summary
-        done = summary.frames + summary.dropped
-        rate = summary.frames / max(now - self._begin, 1e-9)
-        parts = [f"{done} frames", f"{rate:.1f} fps"]
-        if self._total is not None:
-            # A header may announce fewer frames than the file holds.
-            left = max(0, self._total - done)
-            share = done / max(done, self._total)
-            parts[0] = f"{done} of {self._total} frames ({share:.0%})"
-            if done:
-                parts.append(f"{_minutes(left * (now - self._begin) / done)} left")
-        parts += [f"{summary.statuses[s]} {s}" for s in Status if summary.statuses[s]]
-        return "  ".join(parts)
+        counts = self._summary.statuses
+        done = done_text(self._summary, self._total, now - self._begin)
+        return "  ".join([done, *(f"{counts[s]} {s}" for s in Status if counts[s])])
 
 
 class ItemsProgress(_Line):
@@ -119,15 +121,14 @@ class ItemsProgress(_Line):
 
 @contextmanager
 def frames_progress(
-    wanted: bool, summary: RunSummary, length: int | None, max_frames: int | None
+    wanted: bool, summary: RunSummary, total: int | None
 ) -> Iterator[Callable[[PoseInterval], None]]:
     """Yield a function to call with each frame; it does nothing if stderr is not a terminal."""
     stream = sys.stderr
     if not wanted or stream is None or not stream.isatty():
         yield _nothing
         return
-    known = [count for count in (length, max_frames) if count is not None]
-    progress = FramesProgress(stream, summary, min(known, default=None))
+    progress = FramesProgress(stream, summary, total)
     try:
         yield progress.tick
     finally:

@@ -153,10 +153,12 @@ def run(
     truth = None if ground_truth is None else open_ground_truth(ground_truth, source)
     labelled = None if labels is None else open_ground_truth(labels, source)
     with opened(wanted, truth=truth) as job:
-        summary, length = job.summary, job.frames.length
-        watching = frames_progress(output != "-" and not quiet, summary, length, max_frames)
+        summary = job.summary
+        known = [count for count in (job.frames.length, max_frames) if count is not None]
+        total = min(known, default=None)
+        watching = frames_progress(output != "-" and not quiet, summary, total)
         if preview:
-            watching = frames_preview(summary, length, records_here=output == "-")
+            watching = frames_preview(summary, total, records_here=output == "-")
         try:
             with watching as tick:
                 run_frames(

@@ -32,7 +32,7 @@ def test_only_a_frame_that_is_vouched_for_shows_pose_and_bars(estimate):
     lines = panel.panel(estimate, clock.now).plain.split("\n")
     assert len(lines) == 14
     assert max(map(len, lines)) <= 80
-    assert "75 of 300 frames  15.0 fps" in lines[0]
+    assert "75 of 300 frames (25%)  15.0 fps  0:15 left  0.9 marginal" in lines[0]
     assert lines[10] == "70 ok  5 degraded  0 invalid  0 dropped"
     shown = "\n".join(lines)
     assert ("\u2588" in shown) == ("1.000 2.000 3.000 m" in shown) == estimate.vouched

@@ -92,7 +92,7 @@ def test_a_terminal_that_has_gone_does_not_end_the_run():
 )
 def test_nothing_is_shown_where_nobody_wants_or_sees_it(monkeypatch, stream, wanted):
     monkeypatch.setattr(sys, "stderr", stream)
-    with frames_progress(wanted, summary_of(), 10, None) as tick:
+    with frames_progress(wanted, summary_of(), 10) as tick:
         tick()
         assert not hasattr(tick, "__self__")
     assert stream is None or stream.getvalue() == ""
@@ -104,7 +104,7 @@ def test_the_line_is_removed_also_on_an_interrupt_or_an_error(monkeypatch, error
     monkeypatch.setattr(sys, "stderr", terminal)
 
     def watched_run():
-        with frames_progress(True, summary_of(ok=4), 10, 8) as tick:
+        with frames_progress(True, summary_of(ok=4), 8) as tick:
             tick.__self__._next = 0.0
             tick()
             raise error
