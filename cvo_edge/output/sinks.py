@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -21,29 +22,34 @@ from cvo_edge.vocabulary import Existing, Format
 
 Array = NDArray[np.float64]
 
-_SUFFIXES: dict[str, Format] = {
-    ".jsonl": "jsonl",
-    ".csv": "csv",
-    ".tum": "tum",
-    ".mcap": "mcap",
-    ".rrd": "rrd",
-}
+_F = TypeVar("_F", bound=str)
+
+_SUFFIXES = (".jsonl", ".csv", ".tum", ".mcap", ".rrd")
 _CSV_LATENCIES = ("read", "preprocess", "model", "conformal", "total")
 
 
-def format_of(path: str, format: Format | None = None) -> Format:
-    """Return an output's format: as requested, or from the suffix of the path, or ``jsonl``.
+def format_of(path: str, format: _F | None = None, formats: Sequence[_F] = get_args(Format)) -> _F:
+    """Return an output's format: as requested, or from the suffix of the path, or the first one.
 
-    Raises UsageError if the suffix (``.jsonl``, ``.csv``, ``.tum``, ``.mcap``, ``.rrd``)
-    contradicts the requested format.
+    ``formats`` are those that the caller writes. Raises UsageError if the suffix (``.jsonl``,
+    ``.csv``, ``.tum``, ``.mcap``, ``.rrd``) is that of another format than the requested one, or of
+    one that the caller does not write.
     """
-    of_suffix = _SUFFIXES.get(Path(path).suffix.lower())
-    if format and of_suffix and format != of_suffix:
+    suffix = Path(path).suffix.lower()
+    if suffix not in _SUFFIXES:
+        return format or formats[0]
+    of_suffix = next((each for each in formats if suffix == f".{each}"), None)
+    if of_suffix is None:
+        raise UsageError(
+            f"format: expected {' or '.join(formats)}, found the file name {Path(path).name}; "
+            "change the name"
+        )
+    if format and format != of_suffix:
         raise UsageError(
             f"format: expected {of_suffix} for the file name {Path(path).name}, found {format}; "
             "change the name or the format, or omit --format"
         )
-    return format or of_suffix or "jsonl"
+    return of_suffix
 
 
 class Sink:

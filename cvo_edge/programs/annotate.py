@@ -110,13 +110,6 @@ def annotate_stream(
     _write(calibration, level, records, output, existing, written_as, 1)
 
 
-def format_of(path: str, format: MotionFormat | None) -> MotionFormat:
-    """Return an output's format: as requested, or from the suffix of the path, or ``jsonl``."""
-    suffix = Path(path).suffix.lower().removeprefix(".")
-    of_suffix = next((each for each in _FORMATS if each == suffix), None)
-    return format or of_suffix or "jsonl"
-
-
 def _lines(
     needed: Sequence[str], pointed: bool
 ) -> Iterator[tuple[int, NDArray[np.float64] | None, dict[str, float]]]:

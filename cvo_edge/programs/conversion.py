@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.errors import SourceError, UsageError, printable
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.files import whole_path
 from cvo_edge.motion.messages import (
@@ -65,6 +65,7 @@ def convert(
             else:
                 sink.write(estimate)
             count += 1
+        _check_some(count, source)
     return count
 
 
@@ -83,7 +84,14 @@ def _convert_motion(
             for message in messages:
                 file.write(message, record.stamp_ns, record.seq)
             count += 1
+        _check_some(count, source)
     return count
+
+
+def _check_some(count: int, source: Path) -> None:
+    """Raise SourceError for no records; within ``whole_path``, so that no file is left."""
+    if not count:
+        raise SourceError(f"{source}: expected records, found a header alone")
 
 
 def _estimates(source: Path, first: Header) -> Iterator[PoseInterval]:
@@ -99,6 +107,12 @@ def _estimates(source: Path, first: Header) -> Iterator[PoseInterval]:
 
 def _image(estimate: PoseInterval, images: Path) -> StoredImage:
     path = images / estimate.source
+    # Records may come from others, who must not choose what is read.
+    if Path(estimate.source).is_absolute() or ".." in Path(estimate.source).parts:
+        raise SourceError(
+            f"{printable(estimate.source)}: expected the name of a file in {images}, found a path "
+            "out of it"
+        )
     encoding = _ENCODINGS.get(path.suffix.lower())
     if encoding is None:
         raise SourceError(

@@ -72,11 +72,13 @@ def convert(
     from cvo_edge.programs.placing import Placing
 
     if output is None:
+        if recover:
+            raise UsageError("--recover: expected -o FILE.mcap, found no output")
         if format is None or format == "table":
             raise UsageError("convert: expected -o FILE or --to with csv, tum, mcap or rrd")
         output = str(source.with_suffix(f".{format}"))
     check_output(output, source, force=force)
-    written_as = format_of(output, format)
+    written_as: Format = format_of(output, format)
     placing = Placing(base, map, frame_id, child_frame_id, unknown_variance)
     if recover:
         if written_as != "mcap" or images is not None or placing.stated:

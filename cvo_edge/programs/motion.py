@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
@@ -241,7 +241,8 @@ def annotate(
         MotionFormat | None,
         typer.Option(
             help="Format of the records; default: by the file's suffix (.jsonl, .csv, .tum), else "
-            "jsonl. csv has a row for each horizon; tum has the poses alone.",
+            "jsonl. csv has a row for each horizon; tum has the poses alone; convert makes mcap of "
+            "jsonl.",
             show_default=False,
             rich_help_panel=REPORT,
         ),
@@ -271,12 +272,14 @@ def annotate(
 ) -> None:
     """Put intervals on every motion of a trajectory, one JSON record per pose."""
     from cvo_edge.motion.intervals import MotionCalibration
-    from cvo_edge.programs.annotate import annotate_file, annotate_stream, format_of
+    from cvo_edge.output.sinks import format_of
+    from cvo_edge.programs.annotate import annotate_file, annotate_stream
     from cvo_edge.programs.trajectories import Reading
 
     calibration = MotionCalibration.load(motion)
     level = calibration.level(confidence, rule, scope)
-    written_as, existing = format_of(output, format), existing_file(False, force, output)
+    written_as = format_of(output, format, get_args(MotionFormat))
+    existing = existing_file(False, force, written_as)
     if covariance is not None and written_as != "jsonl":
         raise UsageError(f"--covariance: expected the format jsonl, found {written_as}")
     if calibration.pointed and written_as == "csv":

@@ -6,7 +6,7 @@ from collections import Counter
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 
@@ -144,9 +144,11 @@ def odometry(
 
 
 def _format_of(output: str, format: StepFormat | None) -> StepFormat:
-    suffix = Path(output).suffix.lower()
-    of_suffix: StepFormat = "tum" if suffix in (".tum", ".txt") else "jsonl"
-    return format or of_suffix
+    from cvo_edge.output.sinks import format_of
+
+    if format is None and Path(output).suffix.lower() == ".txt":
+        return "tum"
+    return format_of(output, format, get_args(StepFormat))
 
 
 def _lengths(path: Path, fps: float | None) -> Lengths:

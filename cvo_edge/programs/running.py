@@ -45,6 +45,7 @@ from cvo_edge.programs.options import (
     UnknownVarianceOption,
     existing_file,
 )
+from cvo_edge.vocabulary import Format
 
 
 def run(
@@ -119,7 +120,7 @@ def run(
 
     if label_delay and labels is None:
         raise UsageError("--label-delay: expected --labels FILE with it, found no labels")
-    written_as = format_of(output, format)
+    written_as: Format = format_of(output, format)
     wanted = Wanted(
         bundle=bundle,
         source=source,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import math
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from cvo_edge.input.frame import Source
     from cvo_edge.programs.notify import Notifier
     from cvo_edge.programs.service import Service
+    from cvo_edge.vocabulary import Format
 
 # To finish the frames that were given, and to account for them, also on a busy machine.
 _PATIENCE_S = 4.0
@@ -94,7 +96,10 @@ def serve(
     from cvo_edge.programs.run import run as run_frames
     from cvo_edge.programs.service import Service
 
-    written_as = format_of(output, format)
+    # The range of the option's type lets NaN through, which is never due.
+    if not math.isfinite(health_every):
+        raise UsageError(f"--health-every: expected a number of seconds, found {health_every}")
+    written_as: Format = format_of(output, format)
     if output != "-" and written_as not in ("jsonl", "tum"):
         raise UsageError(
             f"serve: expected the format jsonl or tum, which a restart adds to, found {written_as}"

@@ -10,7 +10,10 @@ import pytest
 from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.output.messages import Placement, StoredImage
 from cvo_edge.output.named import reopen_files
+from cvo_edge.output.sinks import Sink
 from cvo_edge.pose import Pose
+from cvo_edge.programs.conversion import convert
+from cvo_edge.programs.placing import Placing
 from cvo_edge.record import Status
 
 from .test_messages import HEADER, frame
@@ -23,6 +26,7 @@ from cvo_edge.output.mcap import McapSink, recover  # noqa: E402 - after the lib
 
 TURNED = Pose(np.array([5.0, 0.0, 1.0]), np.array([0.0, 0.0, np.sin(0.4), np.cos(0.4)]))
 PLACE = Placement("map", "base_link", T_map_world=TURNED)
+NOWHERE = Placing(None, None, None, None, None)
 FRAMES = [frame(seq=0), frame(Status.DEGRADED, seq=1), frame(Status.INVALID, seq=2), frame(seq=3)]
 
 
@@ -158,3 +162,29 @@ def test_another_file_is_not_recovered(tmp_path, content):
     with pytest.raises(SourceError, match="expected an MCAP file"):
         recover(path, str(tmp_path / "b.mcap"))
     assert not (tmp_path / "b.mcap").exists()
+
+
+def records_of(path, *estimates):
+    with Sink(str(path), "jsonl", HEADER) as sink:
+        for each in estimates:
+            sink.write(each)
+    return path
+
+
+@pytest.mark.parametrize("source", ["../secret.png", "/etc/secret.png", "a/../../secret.png"])
+def test_a_record_does_not_name_an_image_outside_the_folder(tmp_path, source):
+    (tmp_path / "frames" / "a").mkdir(parents=True)
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    records = records_of(tmp_path / "a.jsonl", replace(FRAMES[0], source=source))
+    with pytest.raises(SourceError, match="found a path out of it"):
+        convert(records, str(tmp_path / "a.mcap"), "mcap", tmp_path / "frames", NOWHERE)
+    assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize("format", ["mcap", "csv"])
+def test_a_header_alone_makes_no_file(tmp_path, format):
+    records = records_of(tmp_path / "a.jsonl", FRAMES[0])
+    records.write_bytes(records.read_bytes().partition(b"\n")[0] + b"\n")
+    with pytest.raises(SourceError, match="found a header alone"):
+        convert(records, str(tmp_path / f"b.{format}"), format, None, NOWHERE)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.jsonl"]

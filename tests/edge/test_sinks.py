@@ -244,6 +244,12 @@ def test_a_suffix_that_contradicts_the_format_is_refused(name, format):
         format_of(name, format)
 
 
+@pytest.mark.parametrize("name", ["a.mcap", "a.rrd", "a.csv"])
+def test_a_suffix_of_a_format_that_a_command_does_not_write_is_refused(name):
+    with pytest.raises(UsageError, match=rf"expected jsonl or tum, found the file name {name}"):
+        format_of(name, None, ("jsonl", "tum"))
+
+
 def test_an_old_file_is_kept_until_there_is_a_line_to_put_in_its_place(tmp_path, estimates):
     path = tmp_path / "a.txt"
     path.write_text("# software: cvo-edge 0\n" * 9)
