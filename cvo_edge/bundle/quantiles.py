@@ -51,11 +51,11 @@ def threshold_at(calibration: Calibration, confidence: float, scope: Scope) -> T
     found = calibration.threshold(wanted, scope)
     if found is not None:
         return found
+    if not 0.0 < wanted <= _LARGEST_CONFIDENCE:
+        raise UsageError(f"confidence: expected a number between 0 and 1, found {wanted:.15g}")
     table = calibration.quantiles
     if table is None:
         raise _not_stored(calibration, wanted, scope)
-    if not 0.0 < wanted <= _LARGEST_CONFIDENCE:
-        raise UsageError(f"confidence: expected a number between 0 and 1, found {wanted:g}")
     return _between(calibration, table, wanted, scope)
 
 

@@ -57,7 +57,7 @@ def open_sink(
         return RerunSink(path, header, placement)
     if placement is not None:
         raise UsageError(
-            f"frames: expected the format {' or '.join(PLACED)} with --base, --map, frame names or "
-            f"--unknown-variance, found {format}"
+            f"frames: expected {', '.join(PLACED)}, --mavlink or --view with --base, --map, frame "
+            f"names or --unknown-variance, found {format} alone"
         )
     return Sink(path, format, header, region=region, existing=existing, told=told)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 INTERVALS, RUNTIME, REPORT = "Intervals", "Runtime", "Output"
 ADAPTATION = "Adaptation"
-FRAMES = "Frames (mcap, rrd)"
+FRAMES = "Frames of messages"
 _POSE = "<tx,ty,tz,qx,qy,qz,qw>"
 # A thousand years of a camera.
 MOST_FRAMES = 10**12
