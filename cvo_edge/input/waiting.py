@@ -95,7 +95,8 @@ class Waiting:
         if self._lost_s is None:
             return
         now = self._clock.now_s()
-        self._told(f"camera back after {now - self._lost_s:.1f} s and {self.attempts} attempts")
+        attempts = f"{self.attempts} attempt{'s' * (self.attempts != 1)}"
+        self._told(f"camera back after {now - self._lost_s:.1f} s and {attempts}")
         self._lost_s, self._back_s = None, now
         self.attempts = 0
         self.reopened += 1
