@@ -11,7 +11,10 @@ M^-1 Sigma M^-T with the axes M = [Rz Ry ex, Rz ey, ez] that they turn about.
 
 from __future__ import annotations
 
+import io
 import math
+import socket
+from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -68,12 +71,16 @@ class MavlinkSink:
         device, _, baud = address.rpartition(":")
         serial = device.startswith("/dev/") and baud.isdecimal()
         try:
-            self._link: Any = mavutil.mavlink_connection(
-                device if serial else address,
-                baud=int(baud) if serial else 115200,
-            )
+            # What it prints of a refused connection would be among the records.
+            with redirect_stdout(io.StringIO()):
+                self._link: Any = mavutil.mavlink_connection(
+                    device if serial else address,
+                    baud=int(baud) if serial else 115200,
+                )
+            if isinstance(self._link, mavutil.mavudp) and not self._link.udp_server:
+                self._resolve()
         # pyserial's errors are OSErrors; a malformed address ends in any of the others.
-        except (OSError, ValueError, IndexError) as error:
+        except (OSError, ValueError, IndexError, OverflowError) as error:
             raise SinkError(f"mavlink: {address} does not open: {error}") from None
         component = common.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
         self._messages: Any = common.MAVLink(self._link, srcSystem=1, srcComponent=component)
@@ -120,6 +127,21 @@ class MavlinkSink:
             self.sent += 1
         except OSError as error:
             raise SinkError(f"mavlink: {self._address}: {error}") from None
+
+    def _resolve(self) -> None:
+        """Look up the destination of a link by UDP once, which drops what it cannot send.
+
+        Raises OSError for a name that is not known, and ValueError for no port; the link is then
+        closed.
+        """
+        host, port = self._link.destination_addr
+        try:
+            if not 0 < port < 1 << 16:
+                raise ValueError(f"expected a port from 1 to 65535, found {port}")
+            self._link.destination_addr = socket.gethostbyname(host), port
+        except BaseException:
+            self._link.close()
+            raise
 
     def _beat(self) -> None:
         now = self._clock.now_s()

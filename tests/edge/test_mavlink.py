@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cvo_edge import geometry
+from cvo_edge.errors import SinkError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.input.clock import Clock
 from cvo_edge.output.messages import Placement
@@ -83,3 +84,32 @@ def test_a_pose_straight_up_is_not_sent(exchange):
 def test_pauses_and_jumps_count_as_resets(exchange):
     got = exchange([frame(0), frame(1), frame(2, x=30.0), frame(3, x=30.0), frame(30, x=30.0)])
     assert [each.reset_counter for each in got] == [0, 0, 1, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("address", "match"),
+    [
+        ("udpout:127.0.0.1:99999", "expected a port from 1 to 65535, found 99999"),
+        ("udpout:127.0.0.1:0", "expected a port from 1 to 65535, found 0"),
+        ("udpout:no host:14550", "does not open"),
+    ],
+)
+def test_an_address_that_nothing_can_be_sent_to_is_refused(address, match, capsys):
+    from cvo_edge.output.mavlink import MavlinkSink
+
+    with pytest.raises(SinkError, match=match):
+        MavlinkSink(address, PLACE)
+    assert capsys.readouterr().out == ""
+
+
+def test_a_refused_connection_prints_nothing_among_the_records(monkeypatch, capsys):
+    from cvo_edge.output.mavlink import MavlinkSink
+
+    def refused(*_args, **_options):
+        print("[Errno 111] Connection refused sleeping")
+        raise ConnectionRefusedError(111, "Connection refused")
+
+    monkeypatch.setattr(mavutil, "mavlink_connection", refused)
+    with pytest.raises(SinkError, match=r"does not open: .*Connection refused"):
+        MavlinkSink("tcp:127.0.0.1:1", PLACE)
+    assert capsys.readouterr().out == ""
