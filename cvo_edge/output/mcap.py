@@ -66,6 +66,7 @@ class McapFile:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self.messages = 0
+        self._log_ns = 0
         self._stream: BinaryIO | None = None
         try:
             self._stream = opened_empty(path)
@@ -105,7 +106,11 @@ class McapFile:
             raise self._failed(error) from None
 
     def write(self, message: Message, stamp_ns: int, sequence: int) -> None:
-        """Write one message; ``flush`` makes it safe. Raises SinkError."""
+        """Write one message; ``flush`` makes it safe. Raises SinkError.
+
+        After a clock that was set back, or another run, the message keeps its stamp, and is logged
+        at the latest time before it: readers of bags refuse a file that is not in order.
+        """
         try:
             channel = self._channels.get(message.topic)
             if channel is None:
@@ -113,8 +118,9 @@ class McapFile:
             content = self._types.serialize_cdr(
                 self._built(message.type, message.content), message.type
             )
+            self._log_ns = max(self._log_ns, stamp_ns)
             self._writer.add_message(
-                channel, stamp_ns, bytes(content), stamp_ns, sequence & 0xFFFFFFFF
+                channel, self._log_ns, bytes(content), stamp_ns, sequence & 0xFFFFFFFF
             )
             self.messages += 1
         except OSError as error:

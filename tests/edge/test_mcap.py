@@ -164,6 +164,21 @@ def test_another_file_is_not_recovered(tmp_path, content):
     assert not (tmp_path / "b.mcap").exists()
 
 
+def test_stamps_that_go_back_leave_a_file_that_a_strict_reader_takes(tmp_path):
+    path, again = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    frames = [frame(seq=seq) for seq in (5, 6, 0, 1, 7)]
+    with McapSink(str(path), HEADER, PLACE) as sink:
+        for each in frames:
+            sink.write(each)
+    recover(path, str(again))
+    for file in (path, again):
+        with AnyReader([file]) as reader:
+            read = [stamp for one, stamp, _ in reader.messages() if one.topic == "/cvo/pose"]
+        assert read == sorted(read)
+        stamps = [each.header.stamp.nanosec for each in of_topic(file, "/cvo/pose")]
+        assert stamps == [each.stamp_ns % 10**9 for each in frames]
+
+
 def records_of(path, *estimates):
     with Sink(str(path), "jsonl", HEADER) as sink:
         for each in estimates:
