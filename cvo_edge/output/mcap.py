@@ -120,7 +120,7 @@ class McapFile:
             )
             self._log_ns = max(self._log_ns, stamp_ns)
             self._writer.add_message(
-                channel, self._log_ns, bytes(content), stamp_ns, sequence & 0xFFFFFFFF
+                channel, self._log_ns, bytes(content), max(0, stamp_ns), sequence & 0xFFFFFFFF
             )
             self.messages += 1
         except OSError as error:

@@ -168,9 +168,10 @@ def ros_header(estimate: PoseInterval, frame_id: str) -> Content:
 def stamped(stamp_ns: int, frame_id: str, where: str) -> Content:
     """Return a ``std_msgs/Header``; raises UsageError for a stamp that ROS cannot hold."""
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    if not 0 <= seconds < _LARGEST_SECOND:
+    # A node must answer an image with any stamp that ROS gives it, which may be below zero.
+    if not -_LARGEST_SECOND <= seconds < _LARGEST_SECOND:
         raise UsageError(
-            f"stamp: expected one from 1970 to 2038, as ROS holds them, found {stamp_ns} ns at "
+            f"stamp: expected one from 1901 to 2038, as ROS holds them, found {stamp_ns} ns at "
             f"{where}"
         )
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame_id}

@@ -167,9 +167,11 @@ def test_another_file_is_not_recovered(tmp_path, content):
 def test_stamps_that_go_back_leave_a_file_that_a_strict_reader_takes(tmp_path):
     path, again = tmp_path / "a.mcap", tmp_path / "b.mcap"
     frames = [frame(seq=seq) for seq in (5, 6, 0, 1, 7)]
+    impossible = replace(frame(Status.DEGRADED, seq=8), stamp_ns=-5)
     with McapSink(str(path), HEADER, PLACE) as sink:
         for each in frames:
             sink.write(each)
+        sink.write(impossible)
     recover(path, str(again))
     for file in (path, again):
         with AnyReader([file]) as reader:
@@ -177,6 +179,8 @@ def test_stamps_that_go_back_leave_a_file_that_a_strict_reader_takes(tmp_path):
         assert read == sorted(read)
         stamps = [each.header.stamp.nanosec for each in of_topic(file, "/cvo/pose")]
         assert stamps == [each.stamp_ns % 10**9 for each in frames]
+        last = of_topic(file, "/diagnostics")[-1].header.stamp
+        assert (last.sec, last.nanosec) == (-1, 10**9 - 5)
 
 
 def records_of(path, *estimates):

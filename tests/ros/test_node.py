@@ -245,6 +245,16 @@ def test_the_node_says_what_the_table_says(bundle_dir, clip_dir):
     assert given[3].news == "invalid image_unreadable"
 
 
+@pytest.mark.parametrize("stamp_ns", [-5, -(2**31) * 10**9])
+def test_an_image_with_a_stamp_below_zero_does_not_end_the_node(bundle_dir, stamp_ns):
+    sent = [(image_message(BGR, "bgr8", stamp_ns=stamp_ns), 0)]
+    (answer,) = answers(settings(bundle_dir), None, sent, lambda: NOW_NS)
+    assert "stamp_implausible" in answer.news
+    stamp = answer.messages[0].content["header"]["stamp"]
+    assert 10**9 * stamp["sec"] + stamp["nanosec"] == stamp_ns
+    assert not [each for each in answer.messages if each.topic.endswith("pose")]
+
+
 def test_dropped_frames_leave_a_gap_and_the_transform_is_given_on_request(bundle_dir, clip_dir):
     image = next(iter(open_source(str(clip_dir)))).image
     asked = settings(bundle_dir, publish_tf=True, map="0,0,1,0,0,0,1")
