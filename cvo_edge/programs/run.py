@@ -162,7 +162,9 @@ class RunSummary:
             )
         lines.append(f"memory MiB  peak {memory_mib()['peak_rss']:.0f}")
         width = self.width_sum / max(1, self.bounded)
-        lines.append(f"at {self.confidence:g} {self.scope}" + "".join(f"{n:>9}" for n in self.dof))
+        if self.bounded or self.compared:
+            head = f"at {self.confidence:g} {self.scope}"
+            lines.append(head + "".join(f"{name:>9}" for name in self.dof))
         if self.bounded:
             shown = [*map(_length, width[:3].tolist()), *map(_turn, width[3:].tolist())]
             cells = "".join(f"{cell:>9}" for cell in shown)
