@@ -15,6 +15,7 @@ from msgspec import UNSET, Struct, UnsetType
 from numpy.typing import NDArray
 
 from cvo_edge.bundle.format import Calibration, Quaternion
+from cvo_edge.documents import shown
 from cvo_edge.errors import SourceError
 from cvo_edge.estimate import Drift, PoseInterval
 from cvo_edge.given import given_path
@@ -243,6 +244,11 @@ def _header_or_record(line: bytes) -> Header | Record:
         return _RECORD.decode(line)
     except msgspec.ValidationError:
         # Records have no key "kind"; for an invalid header, its own error is more precise.
-        if _KIND.decode(line).kind == "header":
+        kind = _KIND.decode(line).kind
+        if kind == "header":
             return _HEADER.decode(line)
+        if kind is not None:
+            raise msgspec.ValidationError(
+                f"expected one of cvo-edge run or serve, found one of {shown(kind)}"
+            ) from None
         raise

@@ -282,6 +282,14 @@ def test_a_whole_line_that_is_no_record_is_named(recorded, tmp_path, line):
         read_records(wrong)
 
 
+@pytest.mark.parametrize("kind", ["odometry", "motion"])
+def test_records_of_another_command_say_whose_they_are(tmp_path, kind):
+    path = tmp_path / "other.jsonl"
+    path.write_text(f'{{"kind":"{kind}","schema_version":1}}\n')
+    with pytest.raises(SourceError, match=rf"of cvo-edge run or serve, found one of '{kind}'"):
+        read_records(path)
+
+
 def test_a_header_of_a_later_version_says_so(recorded, tmp_path):
     path = tmp_path / "later.jsonl"
     path.write_bytes(recorded[0].read_bytes().replace(b'"schema_version":1', b'"schema_version":2'))
