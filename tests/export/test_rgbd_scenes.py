@@ -56,7 +56,7 @@ def test_images_are_colour_and_the_camera_is_scaled_to_them(tmp_path):
     assert found.read_image(2).shape == (48, 64, 3)
     assert found.read_image(2)[0, 0].tolist() == [20, 20, 20]
     assert found.left_out == {"marked depth": 3}
-    assert "left out    3 images: marked depth 3" in describe(found)
+    assert "left out    3 files: marked depth 3" in describe(found)
     assert found.intrinsics == pytest.approx((57.03, 57.03, 32, 24))
 
 
