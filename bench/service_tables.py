@@ -63,7 +63,7 @@ def four_cameras() -> str:
         counts = [each["frames"] for each in cameras]
         rows.append(
             [
-                f"{run['way']}, {run['method']} {run['precision']}",
+                f"{run['way']}, {run['method']} {run['precision']}, {run['fps']:g} fps",
                 " ".join(str(each["delivered"]) for each in cameras),
                 " ".join(map(str, counts)),
                 " ".join(str(each["dropped_frames"]) for each in cameras),
