@@ -69,6 +69,17 @@ def checked_mode(mode: str) -> Mode:
     raise UsageError(f"mode: expected one of {', '.join(MODES)}, found {mode!r}")
 
 
+def usual_mode(frames: Source, *, adapts: bool) -> Mode:
+    """Return the fastest mode for a source that loses nothing.
+
+    Several frames at once start before the labels of the first of them can count, and are given
+    when later ones have come: not for an odometer that adapts, nor for frames that are waited for.
+    """
+    if frames.live:
+        return "live"
+    return "latency" if adapts or frames.length is None else "throughput"
+
+
 def run_stream(
     frames: Iterable[Frame | NDArray[Any]],
     mode: Mode,

@@ -26,6 +26,7 @@ from cvo_edge.process import say
 from cvo_edge.programs.options import model_cache
 from cvo_edge.programs.placing import Placing
 from cvo_edge.programs.run import RunSummary
+from cvo_edge.scheduling import usual_mode
 from cvo_edge.vocabulary import Existing, Format, Mode, Scope
 
 # What is written, and what opens it.
@@ -114,7 +115,7 @@ def opened(
         Odometer.load(
             wanted.bundle,
             threads=wanted.threads,
-            mode=wanted.mode or ("live" if frames.live else "latency"),
+            mode=wanted.mode or usual_mode(frames, adapts=wanted.adapt),
             confidence=wanted.confidence,
             scope=wanted.scope,
             camera=read_camera(wanted.camera) if wanted.camera else None,

@@ -158,7 +158,8 @@ ModeOption = Annotated[
     typer.Option(
         metavar="<mode>",
         help="live: newest frame, least processor time; latency: every frame, each as fast as "
-        "possible; throughput: most frames per second. Default: live for a camera, else latency.",
+        "possible; throughput: most frames per second. Default: live for a camera, throughput for "
+        "a recording, latency for one that has no end yet or comes with labels.",
         show_default=False,
         rich_help_panel=RUNTIME,
     ),

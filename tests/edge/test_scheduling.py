@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 from itertools import pairwise
+from types import SimpleNamespace
 
 import cv2
 import msgspec
@@ -14,7 +15,7 @@ import pytest
 from cvo_edge import Frame, Odometer, Reason, SourceError, UsageError, open_source
 from cvo_edge.input.capture import READER
 from cvo_edge.input.newest import Newest, Played
-from cvo_edge.scheduling import in_order, plan
+from cvo_edge.scheduling import in_order, plan, usual_mode
 from cvo_edge.vocabulary import MODES
 
 # Only a defect makes a wait take this long.
@@ -216,6 +217,21 @@ def test_a_process_exits_cleanly_while_a_video_is_being_read(bundle_dir, clip_di
     arguments = [str(bundle_dir), str(path), "--mode", "live", "--max-frames", "2", "--quiet"]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr, len(done.stdout.splitlines())) == (0, "", 1 + 2)
+
+
+@pytest.mark.parametrize(
+    ("live", "length", "adapts", "mode"),
+    [
+        (True, None, False, "live"),
+        (True, None, True, "live"),
+        (False, 50, False, "throughput"),
+        (False, 50, True, "latency"),
+        (False, None, False, "latency"),
+    ],
+)
+def test_recordings_are_read_as_fast_as_nothing_is_lost(live, length, adapts, mode):
+    source = SimpleNamespace(live=live, length=length)
+    assert usual_mode(source, adapts=adapts) == mode
 
 
 def test_a_recording_without_stamps_is_not_played_live(bundle_dir, clip_dir):
