@@ -232,8 +232,9 @@ class Day:
         """Return what the service has said but for health lines and summaries."""
         words = ("camera ", "records are", "clock ", "stood", "stuck", "No space", "renamed")
         lines = [line for life in self.unit.lives for line in life.lines]
+        folder = f"{self.unit.output.parent}/"
         return [
-            line
+            line.replace(folder, "")
             for line in lines
             if any(word in line for word in words)
             and not line.startswith(("health:", "camera     "))
