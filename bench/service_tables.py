@@ -20,8 +20,8 @@ def day() -> str:
 
 
 def _shown(line: str) -> str:
-    """Return a line without the places of a test machine."""
-    line = re.sub(r"http://\S+?: |/\S*records\.jsonl: ", "", line)
+    """Return a line without the address of the camera."""
+    line = re.sub(r"http://\S+?: ", "", line)
     return f"`{line}`"
 
 
