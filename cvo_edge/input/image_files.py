@@ -86,10 +86,14 @@ class ImageFiles:
             self._stamps_ns = stamps_in_names(map(frame_name, files)) or repeat(None)
         self.length: int | None = len(self._names)
 
+    @property
+    def paths(self) -> Iterator[str]:
+        """The files, in order."""
+        return (os.path.join(self._folder, name) for name in self._names)  # noqa: PTH118
+
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield one call a file."""
-        for name, stamp_ns in zip(self._names, self._stamps_ns, strict=False):
-            path = os.path.join(self._folder, name)  # noqa: PTH118
+        for path, stamp_ns in zip(self.paths, self._stamps_ns, strict=False):
             yield partial(read_image_file, path, stamp_ns, self._bits)
 
     def __iter__(self) -> Iterator[Frame]:

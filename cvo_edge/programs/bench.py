@@ -41,8 +41,6 @@ _DEFAULT_HEIGHT, _DEFAULT_WIDTH = 480, 640
 _LIVE_FPS = 30
 # How often a stream and bare calls alternate.
 _ROUNDS = 5
-# Share of the time spent waiting for a core that counts as a busy machine.
-_BUSY_SHARE = 0.05
 
 
 @dataclass
@@ -98,14 +96,26 @@ def benchmark(
             f"bench: expected frames >= 1 and warmup >= 0, found {frames} and {warmup}"
         )
     start = perf_counter()
-    odometer = Odometer.load(
+    with Odometer.load(
         bundle, threads=threads, mode=mode, confidence=confidence, scope=scope, cache=cache
-    )
-    load_ms = 1e3 * (perf_counter() - start)
+    ) as odometer:
+        load_ms = 1e3 * (perf_counter() - start)
+        return _measured(odometer, source, frames, warmup, threads, load_ms)
+
+
+def _measured(
+    odometer: Odometer,
+    source: str | None,
+    frames: int,
+    warmup: int,
+    threads: int | None,
+    load_ms: float,
+) -> dict[str, Any]:
     session = odometer.session
     if session is None:  # pragma: no cover - just loaded
         raise UsageError("bench: expected an open odometer")
-    stream = _Endless(source, _still_size(odometer.calibration), threads)
+    calibration = odometer.calibration
+    stream = _Endless(source, _still_size(calibration), threads)
     first = next(iter(stream))
     odometer.step(first.image)
     first_interval_ms = _process_age_ms()
@@ -115,10 +125,12 @@ def benchmark(
         raise SourceError(f"{shown(source or 'image')}: none of {frames} frames is valid")
     counted = found.latency.count
     return {
-        "bundle": odometer.calibration.name,
-        "method": odometer.calibration.method,
-        "precision": odometer.calibration.model.precision,
-        "provider": odometer.calibration.model.provider,
+        "bundle": calibration.name,
+        "bundle_digest": calibration.digest,
+        "method": calibration.method,
+        "precision": calibration.model.precision,
+        "provider": calibration.model.provider,
+        "source": None if source is None else shown(source),
         "mode": odometer.mode,
         "frames": frames,
         "frames_valid": found.valid,
@@ -219,71 +231,15 @@ def _blank_feeds(odometer: Odometer) -> dict[str, Any]:
     return {"image": image, **odometer.head.extra_inputs(0)}
 
 
-def benchmark_lines(report: dict[str, Any]) -> list[str]:
-    """Return the report as lines of readable text."""
-    header = f"{'ms':<12}" + "".join(f"{name:>9}" for name in ("p50", "p90", "p95", "p99", "mean"))
-    rows = {**report["latency_ms"], "bare model": report["raw_model_ms"]}
-    where = report["environment"]
-    return [
-        f"{report['bundle']} ({report['method']}, {report['precision']} on {report['provider']}), "
-        f"mode {report['mode']}: {report['frames']} frames after {report['warmup']} warm-up, "
-        f"{where['threads']} threads on {where['cpu']}",
-        header,
-        *(f"{k:<12}" + "".join(f"{v:>9.3f}" for v in row.values()) for k, row in rows.items()),
-        f"{_RATIOS[report['mode']]} over the bare model call: "
-        f"{report['ratio_to_raw']['median']:.3f}",
-        f"{report['throughput_fps']:.0f} frames/s, {report['cpu_ms_per_frame']:.2f} CPU-ms "
-        f"per frame, load {report['load_ms']:.0f} ms, first interval "
-        f"{_number(report['first_interval_ms'])} ms after process start",
-        *_remarks(report),
-        "memory MiB: " + ", ".join(f"{k} {_number(v)}" for k, v in report["memory_mib"].items()),
-    ]
-
-
-_RATIOS = {
-    "latency": "array to interval",
-    "throughput": "time per frame",
-    "live": "age of a frame at its interval",
-}
-
-
 def _raw_ms(session: Session, feeds: dict[str, Any]) -> float:
     begin = perf_counter()
     session.run(feeds)
     return 1e3 * (perf_counter() - begin)
 
 
-def _number(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.0f}"
-
-
 def _since(waited_s: float | None) -> float | None:
     now_s = waited_for_cores_s()
     return None if now_s is None or waited_s is None else now_s - waited_s
-
-
-def _remarks(report: dict[str, Any]) -> list[str]:
-    remarks = []
-    if report["frames_skipped"]:
-        remarks.append(f"{report['frames_skipped']} frames dropped for newer ones")
-    if report["frames_valid"] < report["frames"]:
-        remarks.append(
-            f"{report['frames_valid']} of {report['frames']} frames gave a plausible pose; "
-            "give a SOURCE from the bundle's scene to time the conformal step on every frame"
-        )
-    if report["frames_in_alarm"]:
-        remarks.append(f"{report['frames_in_alarm']} frames during an alarm: they have no interval")
-    if report["first_interval_ms"] is None or report["waited_for_cores"] is None:
-        remarks.append(
-            "null where this system does not tell (no /proc): first interval, waiting for cores, "
-            "memory other than the peak"
-        )
-    elif report["waited_for_cores"] > _BUSY_SHARE:
-        remarks.append(
-            f"busy machine: {report['waited_for_cores']:.0%} of the time was spent waiting for a "
-            "core used by other processes; fewer --threads may be faster"
-        )
-    return remarks
 
 
 class _Endless:

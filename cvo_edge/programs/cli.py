@@ -10,27 +10,21 @@ from typing import Annotated, NoReturn
 import typer
 
 from cvo_edge.errors import GateError, UsageError
-from cvo_edge.files import check_output, write_report
+from cvo_edge.files import check_output
 from cvo_edge.process import guarded
-from cvo_edge.programs.convert import (
-    convert,
-)
+from cvo_edge.programs.benching import bench
+from cvo_edge.programs.convert import convert
 from cvo_edge.programs.examine import cache, doctor, inspect, schema, verify
 from cvo_edge.programs.motion import annotate, audit, conformalize
 from cvo_edge.programs.odometry import odometry
 from cvo_edge.programs.options import (
     BundleArgument,
-    CacheOption,
     ForceOption,
-    JsonFileOption,
     JsonOption,
-    ThreadsOption,
     examples,
-    model_cache,
 )
 from cvo_edge.programs.running import run
 from cvo_edge.programs.serve import serve
-from cvo_edge.vocabulary import Mode
 
 app = typer.Typer(
     rich_markup_mode="rich",
@@ -38,9 +32,6 @@ app = typer.Typer(
     help="Pose intervals from camera images: a 6-DoF pose per frame and, for each degree of "
     "freedom, an interval that holds the truth with a stated probability.",
 )
-
-# As many times as fit into memory.
-MOST_MEASURED = 10**7
 
 
 @app.command(
@@ -82,61 +73,14 @@ app.command(
 )(serve)
 
 
-@app.command(
+app.command(
     epilog=examples(
         "cvo-edge bench my-bundle",
         "cvo-edge bench my-bundle flight.mp4 --mode throughput --json bench.json",
-        "cvo-edge bench my-bundle --max-p95-ms 40 --max-rss-mib 200",
+        "cvo-edge bench my-bundle images/ --against-script",
+        "cvo-edge bench my-bundle images/ --compare bench.json --max-p95-ms 40",
     )
-)
-def bench(
-    bundle: BundleArgument,
-    source: Annotated[
-        str | None, typer.Argument(help="As for run; default: a fixed image, 640 pixels wide.")
-    ] = None,
-    frames: Annotated[int, typer.Option(min=1, max=MOST_MEASURED, help="Frames to measure.")] = 200,
-    warmup: Annotated[
-        int, typer.Option(min=0, max=MOST_MEASURED, help="Frames to run before measuring.")
-    ] = 20,
-    mode: Annotated[
-        Mode, typer.Option(help="As for run; live plays files at 30 frames per second.")
-    ] = "latency",
-    threads: ThreadsOption = None,
-    cache: CacheOption = True,
-    json_file: JsonFileOption = None,
-    force: ForceOption = False,
-    max_p95_ms: Annotated[
-        float | None,
-        typer.Option(help="Exit 8 if the total's p95 is longer.", rich_help_panel="Gates"),
-    ] = None,
-    max_rss_mib: Annotated[
-        float | None,
-        typer.Option(help="Exit 8 if peak memory is larger.", rich_help_panel="Gates"),
-    ] = None,
-) -> None:
-    """Measure latency, memory and processor time next to the bare model call."""
-    from cvo_edge.programs.bench import benchmark, benchmark_lines
-
-    if json_file is not None:
-        check_output(json_file, source, bundle, force=force)
-    report = benchmark(
-        bundle,
-        source,
-        frames=frames,
-        warmup=warmup,
-        mode=mode,
-        threads=threads,
-        cache=model_cache(cache),
-    )
-    if json_file is not None:
-        write_report(json_file, report)
-    if json_file != "-":
-        print(*benchmark_lines(report), sep="\n")
-    p95, rss = report["latency_ms"]["total"]["p95"], report["memory_mib"]["peak_rss"]
-    if max_p95_ms is not None and not p95 <= max_p95_ms:
-        raise GateError(f"bench: expected p95 of at most {max_p95_ms:g} ms, found {p95:.3f} ms")
-    if max_rss_mib is not None and not rss <= max_rss_mib:
-        raise GateError(f"bench: expected peak memory of at most {max_rss_mib:g} MiB, found {rss}")
+)(bench)
 
 
 @app.command(

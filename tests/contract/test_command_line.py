@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from cvo_edge import Odometer, open_source, read_records
-from cvo_edge.programs.bench import benchmark, benchmark_lines
+from cvo_edge.programs.bench import benchmark
+from cvo_edge.programs.bench_report import benchmark_lines
 
 CVO_EDGE = [sys.executable, "-c", "from cvo_edge.__main__ import main; main()"]
 # A script that runs the tests in the background makes their processes ignore SIGINT.

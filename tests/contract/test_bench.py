@@ -1,0 +1,151 @@
+"""What ``bench`` compares: with the script that one would write, and with an earlier report."""
+
+import copy
+import json
+
+import pytest
+
+from cvo_edge.errors import BundleMismatchError, GateError, SourceError, UsageError
+from cvo_edge.programs import regressions, script
+from cvo_edge.programs.bench import benchmark
+from cvo_edge.programs.cli import app
+
+TOLERANCE = 0.15
+
+
+@pytest.fixture(scope="module")
+def report(bundle_dir, clip_dir):
+    found = benchmark(bundle_dir, str(clip_dir), frames=4, warmup=1)
+    turns = script.against_script(bundle_dir, str(clip_dir), frames=4, rounds=1)
+    return {"software": "cvo-edge 1", **found, "against_script": turns}
+
+
+def written(tmp_path, report):
+    path = tmp_path / "earlier.json"
+    path.write_text(json.dumps(report))
+    return path
+
+
+def compared(tmp_path, old, new):
+    path = written(tmp_path, old)
+    return regressions.compared(str(path), regressions.read_report(path), new, TOLERANCE)
+
+
+def changed(report, place, factor):
+    """A report with one number, or word, changed."""
+    changed = copy.deepcopy(report)
+    *path, last = place.split()
+    part = changed
+    for name in path:
+        part = part[name]
+    part[last] = f"another {part[last]}" if factor is None else factor * part[last]
+    return changed
+
+
+def test_the_script_and_each_mode_take_the_same_frames(report):
+    found = report["against_script"]
+    assert (found["frames"], found["script_frames"], found["rounds"]) == (4, 4, 1)
+    for name in ("script", "latency", "throughput"):
+        per_frame, whole = found[name]["ms_per_frame"], found["script"]["ms_per_frame"]
+        assert 0 < found[name]["first_record_ms"]["median"] <= 4 * per_frame["median"] + 0.001
+        ratio = found[name]["over_script"]["median"]
+        assert ratio == pytest.approx(per_frame["median"] / whole["median"], rel=0.001)
+    lines = list(script.script_lines(found))
+    assert len(lines) == 6
+    assert lines[-1] == "the script makes no checks and no intervals"
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "said"),
+    [
+        (0.8, 0.9, "cvo-edge is faster"),
+        (1.1, 1.2, "the script is faster"),
+        (0.9, 1.1, "no clear difference"),
+    ],
+)
+def test_who_is_faster_must_be_so_in_every_round(least, most, said):
+    assert script.verdict({"least": least, "most": most}) == said
+
+
+@pytest.mark.parametrize(
+    ("place", "share", "name"),
+    [
+        ("ratio_to_raw median", 1.0, "array to interval over the bare call"),
+        ("against_script latency over_script median", 1.0, "mode latency over the script"),
+        ("cpu_ms_per_frame", 1.0, "CPU time over the bare call"),
+        ("memory_mib peak_rss", 1.0, "peak memory, MiB"),
+        ("latency_ms total p50", 2.0, "total, ms"),
+    ],
+)
+def test_growth_beyond_the_tolerance_is_a_regression_and_noise_is_not(
+    tmp_path, report, place, share, name
+):
+    for growth, expected in ((1.1 * share, [name]), (0.9 * share, []), (-3.0 * share, [])):
+        new = changed(report, place, 1.0 + growth * TOLERANCE)
+        comparison = compared(tmp_path, report, new)
+        assert comparison.differences == []
+        worse = [figure for figure in comparison.figures if figure.regression]
+        assert [figure.name for figure in worse] == expected
+        text = "\n".join(regressions.comparison_lines(comparison))
+        assert text.count("regression") == 1 + len(expected)
+        if expected:
+            with pytest.raises(GateError, match=rf"found {name} {worse[0].ratio:.2f} times"):
+                regressions.check(comparison)
+        else:
+            regressions.check(comparison)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        *("bundle_digest", "mode", "source", "environment cpu"),
+        "environment versions onnxruntime",
+    ],
+)
+def test_what_makes_reports_incomparable_is_named(tmp_path, report, place):
+    comparison = compared(tmp_path, report, changed(report, place, None))
+    (difference,) = comparison.differences
+    assert f"not comparable: {difference}" in regressions.comparison_lines(comparison)
+    with pytest.raises(BundleMismatchError, match="is not comparable"):
+        regressions.check(comparison)
+
+
+def without(report, key):
+    return {name: value for name, value in report.items() if name != key}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        lambda report: "{",
+        lambda report: "[]",
+        lambda report: '{"software": "cvo-edge 1", "seq": 0}',
+        lambda report: json.dumps(report | {"software": "another"}),
+        # As earlier versions wrote it.
+        lambda report: json.dumps(without(report, "bundle_digest")),
+        lambda report: json.dumps(report | {"ratio_to_raw": {"median": 0.0}}),
+        lambda report: "9" * 400,
+    ],
+)
+def test_a_file_that_is_no_report_is_refused_before_anything_is_measured(
+    tmp_path, report, bundle_dir, content
+):
+    path = tmp_path / "old.json"
+    path.write_text(content(report))
+    with pytest.raises(SourceError, match=f"{path}: expected a report"):
+        app(["bench", str(bundle_dir), "--compare", str(path)], standalone_mode=False)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--against-script", "found none"),
+        ("0 --against-script", "found a camera or pipe: 0"),
+        ("rtsp://10.0.0.7/x --against-script", "found a camera or pipe"),
+        ("--tolerance 0.1", "expected --compare FILE with it"),
+        ("--tolerance nan --compare x.json", "expected 0 to 10, found nan"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(bundle_dir, words, said):
+    with pytest.raises(UsageError, match=said):
+        app(["bench", str(bundle_dir), *words.split()], standalone_mode=False)
