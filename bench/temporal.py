@@ -76,7 +76,7 @@ def reasons(
     checks = StreamChecks()
     for image in images:
         look = Look(model_input(image, *SIZE, "none"), (image.shape[0], image.shape[1]))
-        found = checks.doubts(look, None, 0.0, fresh_noise, moving)
+        found = checks.picture(look, fresh_noise, moving)
         yield () if image_doubt(look) else found
 
 
@@ -310,7 +310,7 @@ def cost_us(images: Images) -> float:
 
     def all_of_them() -> None:
         for look in looks:
-            checks.doubts(look, None, 0.0)
+            checks.picture(look)
 
     all_of_them()
     return round(

@@ -272,19 +272,28 @@ class Odometer(Labelled):
         """
         moving = checked_hint(moving)
         self._watch = StreamWatch(self._observer, self.calibration)
+        work = partial(self._process, moving=moving, beside_others=self.mode == "throughput")
         with closing(
-            run_stream(
-                frames, self.mode, self._workers, self._process, lambda: self._seq, self._clock
-            )
+            run_stream(frames, self.mode, self._workers, work, lambda: self._seq, self._clock)
         ) as stream:
             for processed in stream:
-                yield self.conclude(processed.told(moving))
+                yield self.conclude(processed)
 
-    def _process(self, frame: Frame, seq: int) -> Processed:
-        """Process a frame as far as it does not depend on earlier frames; thread-safe."""
+    def _process(
+        self,
+        frame: Frame,
+        seq: int,
+        *,
+        moving: bool | None = None,
+        beside_others: bool = False,
+    ) -> Processed:
+        """Process a frame; ``beside_others`` in threads, and as far as no other frame matters."""
+        frame = frame.told(moving)
         waited_ms = max(frame.read_ms, frame.since_arrival_ms(self._clock.now_s()))
         start = perf_counter()
-        observation = self.observe(frame.image, seq)
+        prepared = self._observer.prepare(frame.image)
+        picture = None if beside_others else self._watch.picture(prepared.look, frame)
+        observation = self._observer.infer(prepared, seq)
         observed = perf_counter()
         usable = observation.fault is None and observation.doubt is None
         level = None if self._adaptation is None else self._adaptation.level
@@ -292,7 +301,7 @@ class Odometer(Labelled):
         found = self.conformal_set(observation, threshold) if usable else unbounded_set()
         end = perf_counter()
         conformal_ms, total_ms = 1e3 * (end - observed), waited_ms + 1e3 * (end - start)
-        return Processed(frame, seq, observation, found, conformal_ms, total_ms, level)
+        return Processed(frame, seq, observation, found, conformal_ms, total_ms, level, picture)
 
     def conclude(self, processed: Processed) -> PoseInterval:
         """Apply the stream checks and build the estimate; call it once per frame, in order.
@@ -304,7 +313,10 @@ class Odometer(Labelled):
         fault, found = observation.fault, processed.conformal_set
         # The age counts until the estimate is given: a process may be stopped at any point.
         age_ms = frame.age_ms(self._clock.now_s())
-        verdict = self._watch.judge(observation, processed.seq, frame, age_ms)
+        picture = processed.picture
+        if picture is None:
+            picture = self._watch.picture(observation.look, frame)
+        verdict = self._watch.judge(observation, picture, processed.seq, frame, age_ms)
         doubts = verdict.doubts
         centre = self.chart.turn_centre(observation.point)
         found = unbounded_set() if doubts else found.trimmed(centre)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 from cvo_edge.engine.observation import Observation
 from cvo_edge.input.frame import Frame
 from cvo_edge.monitor.adaptation import Level
+from cvo_edge.record import Reason
 from cvo_edge.sets import ConformalSet
 
 
@@ -16,7 +16,8 @@ class Processed(NamedTuple):
 
     ``conformal_set`` is unbounded if the observation has a fault or a doubt. ``conformal_ms`` is
     the time for the set, ``total_ms`` the time from reading the frame to the set, ``level`` the
-    thresholds of the set if the odometer adapts.
+    thresholds of the set if the odometer adapts. ``picture`` holds the doubts of the stream about
+    the picture, None for a frame that was processed beside others of its stream.
     """
 
     frame: Frame
@@ -26,12 +27,7 @@ class Processed(NamedTuple):
     conformal_ms: float
     total_ms: float
     level: Level | None = None
-
-    def told(self, moving: bool | None) -> Processed:
-        """Return it with what is known of the camera's motion, unless the frame says it itself."""
-        if moving is None or self.frame.moving is not None:
-            return self
-        return self._replace(frame=replace(self.frame, moving=moving))
+    picture: tuple[Reason, ...] | None = None
 
     def latency_ms(self) -> dict[str, float]:
         """Return milliseconds per stage, as in a record."""

@@ -169,13 +169,13 @@ class ConformalSet:
                 centres=point + factor * (ellipsoids.centres - point),
                 scale=factor * ellipsoids.scale,
             )
-        return replace(
-            self,
-            lower=point + factor * (self.lower - point),
-            upper=point + factor * (self.upper - point),
-            bands=bands,
-            ellipsoids=ellipsoids,
+        # For six numbers plain Python is faster than numpy.
+        centre = point.tolist()
+        lower, upper = (
+            np.array([at + factor * (y - at) for at, y in zip(centre, side.tolist(), strict=True)])
+            for side in (self.lower, self.upper)
         )
+        return ConformalSet(lower, upper, bands, self.crossed, ellipsoids)
 
     def width(self) -> Array:
         """Return the width per DoF, (6,): the total length of the bands, not of their hull."""

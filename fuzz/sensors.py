@@ -198,7 +198,7 @@ def _told_of(decoded: Image | None, twice: bool, checks: StreamChecks) -> str:
         return "clean, unreadable"
     look = Look(model_input(image, *_MODEL_SIZE, "none"), (image.shape[0], image.shape[1]))
     doubt = image_doubt(look)
-    doubts = (*((doubt,) if doubt else ()), *checks.doubts(look, None, 0.0))
+    doubts = (*((doubt,) if doubt else ()), *checks.picture(look))
     if doubts == (Reason.FRAME_REPEATED,) and twice:
         return "twice in the recording, frame_repeated"
     return f"clean, {', '.join(doubts) or 'ok'}"

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import le
 from time import perf_counter
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,27 @@ _SOLVER_ROUNDING_PX = 0.5
 _FEW = 64
 _NO_POSE = np.full(7, np.nan)
 _NO_POSE.setflags(write=False)
+
+
+class Prepared(NamedTuple):
+    """What the network gets of one image, and the results of the checks of that image.
+
+    Attributes
+    ----------
+    tensor, look
+        The model's input (1, height, width, 3) uint8 RGB, and image data for the stream checks;
+        both None if there is no image.
+    fault, doubt
+        As for ``Observation``.
+    preprocess_ms
+        Time that this took.
+    """
+
+    tensor: NDArray[np.uint8] | None = None
+    look: Look | None = None
+    fault: Reason | None = None
+    doubt: Reason | None = None
+    preprocess_ms: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +159,8 @@ class Observer:
         self._solver = head.solver(self._seen)
         # The view is found by the cameras, not by the image's shape alone.
         self._matched = self._cameras is not None and (head.solves or camera is not None)
+        # Of the last image: nearly all of a stream have one size.
+        self._last_view: tuple[tuple[int, int], View] | None = None
         self._known = self._known_images(camera, images)
         reference = None if pose.reference_q_xyzw is None else np.array(pose.reference_q_xyzw)
         absolute = pose.rotation == "tangent_reference"
@@ -177,23 +201,36 @@ class Observer:
         ModelError
             Inference failed.
         """
-        session = self.session
-        if session is None:
-            raise UsageError("the odometer is closed; load it again")
+        return self.infer(self.prepare(image_bgr), seq)
+
+    def prepare(self, image_bgr: NDArray[Any] | None) -> Prepared:
+        """Bring one image to the network's input and check it; argument as for ``observe``."""
         if image_bgr is None:
-            return _faulty(Reason.IMAGE_UNREADABLE)
+            return Prepared(fault=Reason.IMAGE_UNREADABLE)
         start = perf_counter()
         image = preprocess.to_bgr8(image_bgr)
         if image is None:
-            return _faulty(Reason.IMAGE_UNSUPPORTED)
-        height, width = image.shape[0], image.shape[1]
-        view = self._view(height, width)
+            return Prepared(fault=Reason.IMAGE_UNSUPPORTED)
+        size = image.shape[0], image.shape[1]
+        if (last := self._last_view) is None or last[0] != size:
+            self._last_view = last = size, self._view(*size)
+        view = last[1]
         tensor = preprocess.viewed(image, view)[np.newaxis]
-        look = Look(tensor, (height, width))
+        look = Look(tensor, size)
         doubt = image_doubt(look)
         if doubt is None and self._known is not None:
             doubt = self._known.doubt(look, view.enlarged)
-        ready = perf_counter()
+        return Prepared(tensor, look, None, doubt, 1e3 * (perf_counter() - start))
+
+    def infer(self, prepared: Prepared, seq: int) -> Observation:
+        """Run the network on what ``prepare`` returned; number and errors as for ``observe``."""
+        session = self.session
+        if session is None:
+            raise UsageError("the odometer is closed; load it again")
+        tensor, look, fault, doubt, preprocess_ms = prepared
+        if tensor is None:
+            return Observation({}, _NO_POSE, _NO_POSE[:6], fault)
+        start = perf_counter()
         outputs: Mapping[str, NDArray[Any]]
         outputs = session.run({"image": tensor, **self._head.extra_inputs(seq)})
         fault = _output_fault(outputs)
@@ -202,8 +239,8 @@ class Observer:
             doubt = doubt or unsure
         done = perf_counter()
         pose, point, fault = self._checked(outputs, fault)
-        spent_ms = 1e3 * (ready - start), 1e3 * (done - ready)
-        return Observation(outputs, pose, point, fault, doubt, look, *spent_ms)
+        model_ms = 1e3 * (done - start)
+        return Observation(outputs, pose, point, fault, doubt, look, preprocess_ms, model_ms)
 
     def solver_error(self) -> float:
         """As ``Head.solver_error``, for the camera of the images."""
@@ -256,12 +293,8 @@ class Observer:
         if self._limits_chart is not self.chart:
             plausible = self._limits_chart.point(pose)
         # Written so that NaN (a zero quaternion) fails the check.
-        inside = all(
-            lowest <= value <= highest
-            for lowest, value, highest in zip(
-                self._limits.lowest, plausible.tolist(), self._limits.highest, strict=True
-            )
-        )
+        place, limits = plausible.tolist(), self._limits
+        inside = all(map(le, limits.lowest, place)) and all(map(le, place, limits.highest))
         return pose, point, fault if inside else Reason.POSE_IMPLAUSIBLE
 
 
@@ -278,9 +311,8 @@ def _sensible(output: NDArray[np.float32]) -> bool:
     if output.size > _FEW:
         return bool(np.abs(output).max() < MAX_NUMBER)
     values = output.ravel().tolist()
+    # The usual case in one call: no number is larger than their norm, which NaN makes NaN.
+    if math.hypot(*values) < MAX_NUMBER:
+        return True
     # max() may miss a NaN that is not the first value; sum() does not.
     return max(map(abs, values)) < MAX_NUMBER and not math.isnan(sum(values))
-
-
-def _faulty(reason: Reason) -> Observation:
-    return Observation({}, _NO_POSE, _NO_POSE[:6], reason)

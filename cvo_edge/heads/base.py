@@ -211,7 +211,7 @@ class Head(ABC):
         found = self.plain_set(outputs, point, threshold)
         if self.difficulty is None:
             return found
-        return found.stretched(point, float(self.difficulty.factors(outputs)[0]))
+        return found.stretched(point, self.difficulty.factor(outputs[NOVELTY_OUTPUT][0].tolist()))
 
     @abstractmethod
     def plain_scores(

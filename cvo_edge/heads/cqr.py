@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import gt
 from typing import Any, ClassVar
 
 import numpy as np
@@ -35,7 +36,9 @@ from cvo_edge.sets import ConformalSet
 from cvo_edge.vocabulary import Joint, Scope, Sides
 
 Array = NDArray[np.float64]
+Six = Sequence[float]
 
+_ZEROS = (0.0,) * 6
 _POINT: dict[str, tuple[int, ...]] = {"pose": (1, 7)}
 _BOUNDED: dict[str, tuple[int, ...]] = {**_POINT, "lower": (1, 6), "upper": (1, 6)}
 
@@ -57,24 +60,29 @@ class IntervalScore:
         above = (truth - point) / np.maximum(upper - point, self.floor)
         return np.stack([below, above], axis=1)
 
-    def inverse(
-        self, lower: Array, upper: Array, point: Array, q_low: Array, q_high: Array
-    ) -> ConformalSet:
-        """Bounds, point and thresholds (6,) of a frame -> its set, or the midpoint if empty."""
+    def inverse(self, lower: Six, upper: Six, point: Six, q_low: Six, q_high: Six) -> ConformalSet:
+        """Bounds, point and thresholds of a frame -> its set, or the midpoint if it is empty.
+
+        Six numbers each, finite but for the thresholds; for so few, numpy would take longer.
+        """
         if self.floor is None:
-            lower, upper = lower - q_low, upper + q_high
+            low = [bound - q for bound, q in zip(lower, q_low, strict=True)]
+            high = [bound + q for bound, q in zip(upper, q_high, strict=True)]
         else:
-            lower, upper = (
-                point - q_low * np.maximum(point - lower, self.floor),
-                point + q_high * np.maximum(upper - point, self.floor),
-            )
-        crossed = lower > upper
-        if not crossed.any():
-            return ConformalSet(lower, upper)
-        middle = 0.5 * (lower + upper)
-        return ConformalSet(
-            np.where(crossed, middle, lower), np.where(crossed, middle, upper), crossed=True
-        )
+            floor = self.floor.tolist()
+            low = [
+                at - q * max(at - bound, least)
+                for at, bound, q, least in zip(point, lower, q_low, floor, strict=True)
+            ]
+            high = [
+                at + q * max(bound - at, least)
+                for at, bound, q, least in zip(point, upper, q_high, floor, strict=True)
+            ]
+        crossed = any(map(gt, low, high))
+        if crossed:
+            pairs = [_uncrossed(*pair) for pair in zip(low, high, strict=True)]
+            low, high = ([pair[side] for pair in pairs] for side in (0, 1))
+        return ConformalSet(np.array(low), np.array(high), crossed=crossed)
 
 
 class CqrParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -156,12 +164,13 @@ class CqrHead(Head):
         self, outputs: Mapping[str, NDArray[Any]], point: Array, threshold: Threshold
     ) -> ConformalSet:
         """Outputs and point (6,) of one frame -> its set, or the midpoint if the set is empty."""
-        lower, upper = self._interval(outputs, point)
-        q_low = infinite_where_null(threshold.q_hat)
-        q_high = q_low
+        lower = upper = at = point.tolist()
+        if self._bounds:
+            lower, upper = outputs["lower"].ravel().tolist(), outputs["upper"].ravel().tolist()
+        q_low = q_high = infinite_where_null(threshold.q_hat).tolist()
         if threshold.q_hat_upper is not None:
-            q_high = infinite_where_null(threshold.q_hat_upper)
-        return self._score.inverse(lower.reshape(6), upper.reshape(6), point, q_low, q_high)
+            q_high = infinite_where_null(threshold.q_hat_upper).tolist()
+        return self._score.inverse(lower, upper, at, q_low, q_high)
 
     def candidates(self) -> tuple[Candidate, ...]:
         """As ``Head``; a network without bounds has only the residual score."""
@@ -172,8 +181,9 @@ class CqrHead(Head):
         """As ``Head``: the set of the additive score at the threshold zero."""
         if not self._bounds:
             return []
-        rows = zip(*self._interval(outputs, point), point, strict=True)
-        return [IntervalScore(None).inverse(*row, np.zeros(6), np.zeros(6)) for row in rows]
+        lower, upper = self._interval(outputs, point)
+        rows = zip(lower.tolist(), upper.tolist(), point.tolist(), strict=True)
+        return [IntervalScore(None).inverse(*row, _ZEROS, _ZEROS) for row in rows]
 
     def description(self) -> str:
         """As ``Head``: which bounds are calibrated."""
@@ -183,6 +193,11 @@ class CqrHead(Head):
         if not self._bounds:
             return point, point
         return outputs["lower"].astype(np.float64), outputs["upper"].astype(np.float64)
+
+
+def _uncrossed(low: float, high: float) -> tuple[float, float]:
+    """Return both bounds, or their midpoint twice if the lower one is above the upper one."""
+    return (low, high) if low <= high else (0.5 * (low + high),) * 2
 
 
 def refuse_negative(entry: Threshold, what: str) -> None:

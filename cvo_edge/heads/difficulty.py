@@ -37,9 +37,9 @@ class Difficulty:
 
     def factors(self, outputs: Mapping[str, NDArray[Any]]) -> Array:
         """Outputs stacked over n frames -> u (n,)."""
-        return np.array([self._factor(row) for row in outputs[NOVELTY_OUTPUT].tolist()])
+        return np.array([self.factor(row) for row in outputs[NOVELTY_OUTPUT].tolist()])
 
-    def _factor(self, novelty: list[float]) -> float:
+    def factor(self, novelty: list[float]) -> float:
         """Return u of one frame; for four numbers plain Python is faster than numpy."""
         spec = self.spec
         log_u = spec.bias + sum(

@@ -160,7 +160,8 @@ class McqrHead(Head):
             ellipsoids = Ellipsoids(codebook, scale, radius)
             return ConformalSet(lowest - reach, highest + reach, ellipsoids=ellipsoids)
         lower, upper = lowest - extent, highest + extent
-        return self._score.inverse(lower, upper, 0.5 * (lower + upper), q_hat, q_hat)
+        middle, q = 0.5 * (lower + upper), q_hat.tolist()
+        return self._score.inverse(lower.tolist(), upper.tolist(), middle.tolist(), q, q)
 
     def candidates(self) -> tuple[Candidate, ...]:
         """As ``Head``."""

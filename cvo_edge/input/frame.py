@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -48,6 +48,12 @@ class Frame:
             object.__setattr__(self, "source", str(self.source))
         if type(self.read_ms) is not float:
             object.__setattr__(self, "read_ms", given_number(self.read_ms, "read_ms"))
+
+    def told(self, moving: bool | None) -> Frame:
+        """Return it with what is known of the camera's motion, unless it says that itself."""
+        if moving is None or self.moving is not None:
+            return self
+        return replace(self, moving=moving)
 
     def age_ms(self, now_s: float) -> float:
         """Return an upper bound on the frame's age at ``now_s`` of ``Clock.now_s``."""

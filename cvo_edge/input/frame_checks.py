@@ -46,8 +46,9 @@ class Look:
     def __init__(self, tensor: Image8, size: tuple[int, int]) -> None:
         self.size, self.digest = size, Digest.of(tensor)
         half = SAMPLE_STEP // 2
-        self.sample: Image8 = tensor[0, half::SAMPLE_STEP, half::SAMPLE_STEP].reshape(-1, 3)
-        means, deviations = cv2.meanStdDev(self.sample[:, np.newaxis])
+        sample = np.ascontiguousarray(tensor[0, half::SAMPLE_STEP, half::SAMPLE_STEP])
+        self.sample: Image8 = sample.reshape(-1, 3)
+        means, deviations = cv2.meanStdDev(sample)
         self.means: list[float] = means.ravel().tolist()
         self.deviations: list[float] = deviations.ravel().tolist()
 
@@ -74,22 +75,21 @@ class StreamChecks:
         self._repetition = Repetition()
         self._stamp_ns: int | None = None
 
-    def doubts(
-        self,
-        look: Look | None,
-        stamp_ns: int | None,
-        age_ms: float,
-        fresh_noise: bool = True,
-        moving: bool | None = None,
+    def picture(
+        self, look: Look | None, fresh_noise: bool = True, moving: bool | None = None
     ) -> tuple[Reason, ...]:
-        """Compare a frame with earlier ones and store it; ``look`` is None for an invalid image.
+        """Compare a picture with earlier ones and store it; None for an invalid image.
 
         ``fresh_noise`` and ``moving`` are those of the ``Frame``, see ``Repetition``.
         """
+        if look is None:
+            return ()
+        self.unproven += not fresh_noise
+        return self._repetition.doubts(look.digest, fresh_noise=fresh_noise, moving=moving)
+
+    def times(self, stamp_ns: int | None, age_ms: float) -> tuple[Reason, ...]:
+        """Compare a stamp with that of the frame before, and judge the frame's age."""
         doubts: tuple[Reason, ...] = ()
-        if look is not None:
-            self.unproven += not fresh_noise
-            doubts += self._repetition.doubts(look.digest, fresh_noise=fresh_noise, moving=moving)
         if stamp_ns is not None and not 0 <= stamp_ns < _END_NS:
             doubts += (Reason.STAMP_IMPLAUSIBLE,)
         elif stamp_ns is not None:

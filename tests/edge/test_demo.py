@@ -174,19 +174,20 @@ class KnowsItsClip:
         # Statistics are 0 for the clip's own images and 10 for any other; the limit is 2.
         alarm = AlarmSpec(self.kind, (0.0,) * 5, (1.0,) * 5, (2.0,) * 5, 20)
         odometer.calibration = msgspec.structs.replace(odometer.calibration, alarm=alarm)
-        known = {image.tobytes() for image in clip()}
-        observe = odometer.observe
+        observer = odometer._observer
+        known = {observer.prepare(image).tensor.tobytes() for image in clip()}
+        infer = observer.infer
 
-        def observed(image, seq):
-            found = observe(image, seq)
-            value = 0.0 if image.tobytes() in known else 10.0
+        def observed(prepared, seq):
+            found = infer(prepared, seq)
+            value = 0.0 if prepared.tensor.tobytes() in known else 10.0
             outputs = {
                 NOVELTY_OUTPUT: np.full((1, 4), value),
                 DEGRADATION_OUTPUT: np.zeros((1, 1)),
             }
             return replace(found, outputs={**found.outputs, **outputs})
 
-        odometer.observe = observed
+        observer.infer = observed
         return odometer
 
 

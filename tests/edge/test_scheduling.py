@@ -146,13 +146,13 @@ def test_a_frame_that_ages_while_it_is_estimated_is_stale(bundle_dir, clip_dir, 
     frames = [Frame(image, None, "", 0.0, arrived_s=0.0) for image in images]
     delays = iter([0.9, 0.2, 0.0])
     with Odometer.load(bundle_dir, threads=1) as odometer:
-        odometer._clock, observe = clock, odometer.observe
+        odometer._clock, infer = clock, odometer._observer.infer
 
-        def slowly(image, seq):
+        def slowly(prepared, seq):
             clock.now += next(delays)
-            return observe(image, seq)
+            return infer(prepared, seq)
 
-        monkeypatch.setattr(odometer, "observe", slowly)
+        monkeypatch.setattr(odometer._observer, "infer", slowly)
         found = list(odometer.stream(frames))
     assert [each.reasons for each in found] == [(), (Reason.FRAME_STALE,), (Reason.FRAME_STALE,)]
     assert [np.isfinite(each.lower).all() for each in found] == [True, False, False]
