@@ -96,7 +96,7 @@ def publish(
     run = replace(run, dataset=remembered(run.dataset))
     candidates = selected(run.graph.head.candidates(), score, sides)
     rule, cap = chosen_rule(rule, cap, run.split.kind)
-    model_bytes, parity = _export(run, run.graph.head, run.training_frames, precision)
+    model_bytes, parity = _export(run, run.graph.head, run.training_frames, precision, provider)
     draft = _draft(run, model_bytes, name, (rule, cap), joint, parity, provider)
     if run.folds:
         folds = [
@@ -121,7 +121,7 @@ def _fold(
 ) -> Fold:
     """Export the network that was trained without these frames."""
     others = run.training_frames[~np.isin(run.training_frames, indices)]
-    model_bytes, _ = _export(run, head, others, precision)
+    model_bytes, _ = _export(run, head, others, precision, draft.model.provider)
     model = model_spec(model_bytes, OPSET, draft.model.provider)
     candidates = selected(head.candidates(), score, sides)
     return Fold(replace(draft, model=model), model_bytes, candidates, indices)
@@ -158,7 +158,11 @@ class _Deployed(nn.Module):
 
 
 def _export(
-    run: Run, head: ExportedHead, training: NDArray[np.int64], precision: Precision
+    run: Run,
+    head: ExportedHead,
+    training: NDArray[np.int64],
+    precision: Precision,
+    provider: Provider,
 ) -> tuple[bytes, float]:
     """Return the model bytes and the largest difference between torch and onnxruntime on val.
 
@@ -178,7 +182,7 @@ def _export(
     parity = check_parity(trained, session, feeds, names, head.output_names, head.point_outputs)
     if precision == "int8":
         spread = np.linspace(0, training.size - 1, min(_RANGE_FRAMES, training.size)).astype(int)
-        content = quantised(content, _feeds(run, training[spread]))
+        content = quantised(content, _feeds(run, training[spread]), provider)
         session = Session(content)
     completed = head.completed(content)
     if completed != content:

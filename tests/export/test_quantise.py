@@ -92,7 +92,8 @@ def test_every_convolution_is_in_eight_bits_and_the_first_takes_the_pixels(norma
         assert list(constants[made[node.input[1]].input[1]].dims) == list(weight.dims[:1])
     pixels = made[convolutions[0].input[0]]
     assert pixels.op_type == "DequantizeLinear"
-    assert made[pixels.input[0]].op_type == "Transpose"
+    blocks = made[made[pixels.input[0]].input[0]]
+    assert (blocks.op_type, blocks.input[0]) == ("Reshape", "image")
     assert not {"Cast", "Sub", "Div"} & set(kinds(small))
     # Every remaining constant is used.
     read = {name for node in model.graph.node for name in node.input}
@@ -101,6 +102,52 @@ def test_every_convolution_is_in_eight_bits_and_the_first_takes_the_pixels(norma
     expected = np.concatenate([plain.run(feed)["features"] for feed in feeds])
     found = np.concatenate([eight.run(feed)["features"] for feed in feeds])
     assert np.abs(found - expected).max() < 0.1 * np.abs(expected).max()
+
+
+class FirstLayer(nn.Module):
+    """One convolution that reads scaled pixels; its output are its maps."""
+
+    def __init__(self, kernel: int, stride: int, padding: int, outputs: int) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.first = nn.Conv2d(3, outputs, kernel, stride, padding)
+        self.mean = nn.Buffer(torch.tensor([120.0, 115.0, 100.0])[:, None, None])
+        self.second = nn.Conv2d(outputs, 4, 1)
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """Return the maps for images (1, height, width, 3)."""
+        x = (image.permute(0, 3, 1, 2).float() - self.mean) / 60.0
+        return self.second(torch.relu(self.first(x)))
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stride", "padding", "outputs", "width", "rewritten"),
+    [
+        (3, 2, 1, 32, 32, True),
+        (3, 2, 0, 8, 36, False),  # 17 outputs in a row, two together
+        (3, 2, 0, 8, 40, False),
+        (2, 2, 0, 8, 40, True),
+        (7, 2, 3, 64, 32, True),
+        (3, 1, 1, 4, 32, True),
+        (4, 4, 0, 16, 32, True),
+        (5, 4, 2, 16, 28, True),
+        (3, 2, 1, 12, 32, False),  # 24 output channels
+        (3, 2, 1, 32, 30, False),  # 90 bytes in a row
+    ],
+)
+def test_reading_blocks_instead_of_pixels_changes_no_number(
+    kernel, stride, padding, outputs, width, rewritten
+):
+    image = torch.zeros((1, 20, width, 3), dtype=torch.uint8)
+    layer = FirstLayer(kernel, stride, padding, outputs).eval()
+    content = export_onnx(layer, [image], ["image"], ["maps"])
+    generator = np.random.default_rng(0)
+    feeds = [{"image": generator.integers(0, 256, image.shape).astype(np.uint8)} for _ in range(4)]
+    plain, in_blocks = (quantised(content, feeds, each) for each in ("openvino", "onnxruntime"))
+    assert ("Reshape" in kinds(in_blocks)) == rewritten
+    plain, in_blocks = Session(plain, 1), Session(in_blocks, 1)
+    for feed in feeds:
+        np.testing.assert_array_equal(plain.run(feed)["maps"], in_blocks.run(feed)["maps"])
 
 
 def test_where_the_graph_begins_otherwise_the_first_convolution_stays_float(both):

@@ -28,6 +28,8 @@ from onnxruntime.quantization import (
 from onnxruntime.quantization.quant_utils import add_pre_process_metadata
 
 from cvo_edge.errors import UsageError
+from cvo_edge.vocabulary import Provider
+from cvo_export.graph.first_convolution import read_blocks
 
 Feed = Mapping[str, NDArray[np.generic]]
 
@@ -39,12 +41,13 @@ _LARGEST_STEP = 127
 _LEAST_WEIGHT = 1e-8
 
 
-def quantised(content: bytes, feeds: Sequence[Feed]) -> bytes:
+def quantised(content: bytes, feeds: Sequence[Feed], provider: Provider = "onnxruntime") -> bytes:
     """Return the graph with its backbone in 8 bits.
 
     If the graph begins as our exporter writes it, the first convolution reads the image's 8-bit
-    values directly. Otherwise it stays in float32, so that normalised pixels are not rounded again.
-    ``feeds`` are the inputs by name of the frames that give the ranges of the feature maps.
+    values directly, for onnxruntime in blocks (``first_convolution``; OpenVINO would be slower).
+    Otherwise it stays in float32, so that normalised pixels are not rounded again. ``feeds`` are
+    the inputs by name of the frames that give the ranges of the feature maps.
 
     Raises UsageError if the backbone has no convolution, or one with computed weights.
     """
@@ -83,6 +86,9 @@ def quantised(content: bytes, feeds: Sequence[Feed]) -> bytes:
         found = onnx.load(target)
     if zero is not None:
         _take_pixels(found, first.input[0], zero)
+        if provider == "onnxruntime":
+            read_blocks(found, next(node for node in found.graph.node if node.op_type == "Conv"))
+            _drop_unused(found)
     del found.metadata_props[:]
     found.metadata_props.extend(kept)
     written: bytes = found.SerializeToString()
