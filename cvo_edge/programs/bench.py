@@ -75,6 +75,7 @@ def benchmark(
     confidence: float = 0.9,
     scope: Scope = "marginal",
     cache: ModelCache | None = None,
+    stages: bool = False,
 ) -> dict[str, Any]:
     """Time ``frames`` frames in a mode, and as many bare inference calls on the same model.
 
@@ -86,6 +87,7 @@ def benchmark(
     second. Without a source, the benchmark uses a synthetic still image; if its pose is
     implausible, the conformal step is not run. ``frames_valid`` counts frames with a plausible
     pose, ``frames_in_alarm`` those during an alarm. Invalid frames of a source are not timed.
+    ``stages`` measures the stages of as many frames afterwards, see ``cvo_edge.programs.stages``.
     Returns the report of ``cvo-edge bench --json``.
 
     Raises UsageError for invalid counts, SourceError if the source gives no valid frame, and the
@@ -100,22 +102,27 @@ def benchmark(
         bundle, threads=threads, mode=mode, confidence=confidence, scope=scope, cache=cache
     ) as odometer:
         load_ms = 1e3 * (perf_counter() - start)
-        return _measured(odometer, source, frames, warmup, threads, load_ms)
+        stream = _Endless(source, _still_size(odometer.calibration), threads)
+        report = _measured(odometer, source, stream, frames, warmup, load_ms)
+        if stages:
+            from cvo_edge.programs.stages import measure
+
+            report["stages"] = measure(odometer, stream, frames, warmup)
+    return report
 
 
 def _measured(
     odometer: Odometer,
     source: str | None,
+    stream: _Endless,
     frames: int,
     warmup: int,
-    threads: int | None,
     load_ms: float,
 ) -> dict[str, Any]:
     session = odometer.session
     if session is None:  # pragma: no cover - just loaded
         raise UsageError("bench: expected an open odometer")
     calibration = odometer.calibration
-    stream = _Endless(source, _still_size(calibration), threads)
     first = next(iter(stream))
     odometer.step(first.image)
     first_interval_ms = _process_age_ms()
@@ -245,7 +252,7 @@ def _since(waited_s: float | None) -> float | None:
 class _Endless:
     """A source repeated endlessly; without a source, a still image."""
 
-    length = None
+    length: int | None = None
 
     def __init__(
         self, source: str | None, size: tuple[int, int], threads: int | None = None

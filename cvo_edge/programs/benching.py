@@ -10,6 +10,7 @@ import typer
 from cvo_edge.errors import GateError, UsageError
 from cvo_edge.files import check_output, write_report
 from cvo_edge.programs.options import (
+    REPORT,
     BundleArgument,
     CacheOption,
     ForceOption,
@@ -46,6 +47,12 @@ def bench(
     ] = "latency",
     threads: ThreadsOption = None,
     cache: CacheOption = True,
+    stages: Annotated[
+        bool,
+        typer.Option(
+            "--stages", help="Also show where the time of a frame goes.", rich_help_panel=REPORT
+        ),
+    ] = False,
     against_script: Annotated[
         bool,
         typer.Option(
@@ -88,6 +95,7 @@ def bench(
     from cvo_edge.programs import regressions, script
     from cvo_edge.programs.bench import benchmark
     from cvo_edge.programs.bench_report import benchmark_lines
+    from cvo_edge.programs.stages import stage_lines
 
     if tolerance is not None and compare is None:
         raise UsageError("--tolerance: expected --compare FILE with it, found none")
@@ -107,8 +115,11 @@ def bench(
         mode=mode,
         threads=threads,
         cache=models,
+        stages=stages,
     )
     lines = benchmark_lines(report)
+    if stages:
+        lines += stage_lines(report["stages"], mode)
     if against_script:
         found = script.against_script(bundle, files, frames=frames, threads=threads, cache=models)
         report["against_script"] = found

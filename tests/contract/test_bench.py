@@ -2,11 +2,14 @@
 
 import copy
 import json
+from inspect import getattr_static
 
+import numpy as np
 import pytest
 
+from cvo_edge import Odometer, open_source
 from cvo_edge.errors import BundleMismatchError, GateError, SourceError, UsageError
-from cvo_edge.programs import regressions, script
+from cvo_edge.programs import regressions, script, stages
 from cvo_edge.programs.bench import benchmark
 from cvo_edge.programs.cli import app
 
@@ -149,3 +152,52 @@ def test_a_file_that_is_no_report_is_refused_before_anything_is_measured(
 def test_what_cannot_be_compared_is_refused(bundle_dir, words, said):
     with pytest.raises(UsageError, match=said):
         app(["bench", str(bundle_dir), *words.split()], standalone_mode=False)
+
+
+def test_means_of_parts_and_rest_add_up_to_that_of_their_stage():
+    generator = np.random.default_rng(0)
+    calls = []
+    for number in range(50):
+        parts = {("read", "file"): 0.1, ("read", "decode"): 0.5, ("read", "decode", "scan"): 0.2}
+        call = {path: scale * generator.random() for path, scale in parts.items()}
+        if number % 3:  # a part that not every call has
+            del call["read", "file"]
+        calls.append(call | {("read",): 1.0})
+    rows = stages.table({"read": calls, "write": [{("write",): 0.25}] * 50, "conclude": []})
+    by_path = {row.path: row for row in rows}
+    for path, row in by_path.items():
+        parts = [each for each in rows if each.path[:-1] == path]
+        assert (parts == []) == ((*path, "rest") not in by_path)
+        if parts:
+            assert sum(part.mean_us for part in parts) == pytest.approx(row.mean_us)
+    assert sum(row.share for row in rows if len(row.path) == 1) == pytest.approx(1.0)
+    assert by_path["read",].p50_us == by_path["read",].p90_us == 1e6
+    shown = [{"stage": "/".join(row.path), "share": row.share} for row in rows]
+    for row, (begin, end) in zip(rows, stages.places(shown), strict=True):
+        assert end - begin == pytest.approx(row.share)
+        outer = row.path[:-1]
+        if outer:
+            around = stages.places(shown)[rows.index(by_path[outer])]
+            assert around[0] - 1e-9 <= begin <= end <= around[1] + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("method", "mode"), [("scr", "latency"), ("cjp", "throughput"), ("cjp", "live")]
+)
+def test_every_stage_is_found_and_nothing_stays_timed(artifacts_dir, clip_dir, method, mode):
+    places = [(owner, name) for owner, name, _ in stages.HOOKS]
+    before = [getattr_static(*place) for place in places]
+    with Odometer.load(artifacts_dir / f"synthetic-room-{method}", mode=mode) as odometer:
+        source = open_source(str(clip_dir), fps=30.0)
+        found = stages.measure(odometer, source, frames=3, warmup=1)
+    assert [getattr_static(*place) for place in places] == before
+    assert found["frames"] == 3
+    named = {row["stage"].rpartition("/")[2] for row in found["rows"]}
+    solved = {"solver"} if method == "scr" else set()
+    assert named == {stage for _, _, stage in stages.HOOKS} | {"read", "rest"} | solved
+    assert all(row["mean_us"] >= 0.0 for row in found["rows"])
+    outermost = [row for row in found["rows"] if "/" not in row["stage"]]
+    assert [row["stage"] for row in outermost] == list(stages.ROOTS)
+    if mode == "latency":
+        assert sum(row["mean_us"] for row in outermost) <= 1.001 * found["record_every_us"]
+    assert len(list(stages.stage_lines(found, mode))) == len(found["rows"]) + 3
