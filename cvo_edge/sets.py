@@ -125,7 +125,10 @@ class ConformalSet:
         """
         about = np.asarray(turn, dtype=np.float64).tolist()
         sides = [*zip(about * 2, [*self.lower[3:].tolist(), *self.upper[3:].tolist()], strict=True)]
-        if not any(math.pi < abs(bound - at) < math.inf for at, bound in sides):
+        for at, bound in sides:
+            if math.pi < abs(bound - at) < math.inf:
+                break
+        else:
             return self
         low, high = np.split(np.array([_trimmed(at, bound) for at, bound in sides]), 2)
         bands = self.bands

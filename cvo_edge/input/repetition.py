@@ -106,8 +106,10 @@ class Repetition:
         self._numbers = _Seen()
         # The last column is the squared length of the others.
         self._thumbnails = _Newest(_THUMBNAIL[0] * _THUMBNAIL[1] + 1, np.dtype(np.float32))
-        # Squared distances to earlier frames, of the last frames in which the picture moved.
+        # Squared distances to earlier frames, of the last frames in which the picture moved, and
+        # of these the distances to the previous frame.
         self._moving: deque[Numbers] = deque(maxlen=_IN_ORDER)
+        self._steps: deque[float] = deque(maxlen=_IN_ORDER)
 
     def doubts(
         self, digest: Digest, *, fresh_noise: bool = True, moving: bool | None = None
@@ -151,10 +153,11 @@ class Repetition:
         if len(squares) == 0 or not self._moved(thumbnail):
             return False
         self._moving.append(squares)
+        self._steps.append(float(squares[-1]))
         old = squares[: 1 - _SHORTEST_LOOP]
         if len(self._moving) < _IN_ORDER or len(old) == 0:
             return False
-        moved = sum(float(each[-1]) for each in self._moving)
+        moved = sum(self._steps)
         near = min(_IN_ORDER * _STILL**2 * (thumbnail.size - 1), _NEAR**2 * moved)
         # A sum below a limit has no part beyond it: usually, this is the end.
         return bool(old.min() < near) and _is_loop(self._by_lag().sum(axis=0), moved, near)

@@ -54,25 +54,22 @@ class Running:
     """The running statistics of one stream: exponentially weighted means, one row per weight."""
 
     def __init__(self, limits: tuple[float, ...]) -> None:
-        self._most = tuple(_LARGEST * limit for limit in limits)
-        self._means: list[tuple[float, ...]] = []
+        self._most = [_LARGEST * limit for limit in limits]
+        self._means: list[list[float]] = []
 
     def add(self, values: list[float]) -> list[float]:
         """Values r (k,) of the next frame -> M_t (k,)."""
-        kept = tuple(
+        kept = [
             max(_LOWEST, min(value, most)) for value, most in zip(values, self._most, strict=True)
-        )
+        ]
         if not self._means:
-            self._means = [kept for _ in _WEIGHTS]
-        self._means = [
-            tuple(mean + weight * (value - mean) for mean, value in zip(means, kept, strict=True))
+            self._means = [kept, kept]
+        quick, slow = self._means = [
+            [mean + weight * (value - mean) for mean, value in zip(means, kept, strict=True)]
             for weight, means in zip(_WEIGHTS, self._means, strict=True)
         ]
-        scaled = (
-            [factor * mean for mean in means]
-            for factor, means in zip(_FACTORS, self._means, strict=True)
-        )
-        return [max(pair) for pair in zip(*scaled, strict=True)]
+        of_quick, of_slow = _FACTORS
+        return [max(of_quick * a, of_slow * b) for a, b in zip(quick, slow, strict=True)]
 
 
 class StreamAlarm:
