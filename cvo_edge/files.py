@@ -30,6 +30,7 @@ _OURS = re.compile(
     rb"|\x89MCAP0\r\n.{0,40}cvo-edge"
     rb"|RRF2.{0,400}cvo-edge"
     rb"|<\?xml .*<dc:title>cvo-edge "
+    rb'|<!doctype html>\n.{0,100}<meta name="generator" content="cvo-edge '
     # Of earlier versions, and tables.
     rb'|\{"seq":|seq,stamp_ns,|Position and half the width',
     re.DOTALL,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 # Share of the time spent waiting for a core that counts as a busy machine.
@@ -14,7 +15,7 @@ TIMED = {
 }
 
 
-def benchmark_lines(report: dict[str, Any]) -> list[str]:
+def benchmark_lines(report: Mapping[str, Any]) -> list[str]:
     """Return the report as lines of readable text."""
     header = f"{'ms':<12}" + "".join(f"{name:>9}" for name in ("p50", "p90", "p95", "p99", "mean"))
     rows = {**report["latency_ms"], "bare model": report["raw_model_ms"]}
@@ -29,7 +30,7 @@ def benchmark_lines(report: dict[str, Any]) -> list[str]:
         f"{report['throughput_fps']:.0f} frames/s, {report['cpu_ms_per_frame']:.2f} CPU-ms "
         f"per frame, load {report['load_ms']:.0f} ms, first interval "
         f"{_number(report['first_interval_ms'])} ms after process start",
-        *_remarks(report),
+        *remarks(report),
         "memory MiB: " + ", ".join(f"{k} {_number(v)}" for k, v in report["memory_mib"].items()),
     ]
 
@@ -38,7 +39,8 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.0f}"
 
 
-def _remarks(report: dict[str, Any]) -> list[str]:
+def remarks(report: Mapping[str, Any]) -> list[str]:
+    """Return what a reader has to know of a report, in sentences."""
     remarks = []
     if report["frames_skipped"]:
         remarks.append(f"{report['frames_skipped']} frames dropped for newer ones")

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from cvo_edge.errors import GateError, UsageError
-from cvo_edge.files import check_output, write_report
+from cvo_edge.files import check_output, write_report, write_text
 from cvo_edge.programs.options import (
     REPORT,
     BundleArgument,
@@ -81,6 +81,15 @@ def bench(
         ),
     ] = None,
     json_file: JsonFileOption = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the report as a page, with --stages, to a file.html.",
+            readable=False,
+            show_default=False,
+            rich_help_panel=REPORT,
+        ),
+    ] = None,
     force: ForceOption = False,
     max_p95_ms: Annotated[
         float | None,
@@ -92,7 +101,7 @@ def bench(
     ] = None,
 ) -> None:
     """Measure latency, memory and processor time next to the bare model call."""
-    from cvo_edge.programs import regressions, script
+    from cvo_edge.programs import bench_page, regressions, script
     from cvo_edge.programs.bench import benchmark
     from cvo_edge.programs.bench_report import benchmark_lines
     from cvo_edge.programs.stages import stage_lines
@@ -104,10 +113,14 @@ def bench(
     )
     if json_file is not None:
         check_output(json_file, source, bundle, compare, force=force)
+    if report is not None:
+        page = bench_page.checked_page(report)
+        check_output(page, source, bundle, compare, json_file, force=force)
     files = script.check_read_again(source) if against_script else ""
     earlier = None if compare is None else regressions.read_report(compare)
     models = model_cache(cache)
-    report = benchmark(
+    stages = stages or report is not None
+    found = benchmark(
         bundle,
         source,
         frames=frames or 200,
@@ -117,32 +130,34 @@ def bench(
         cache=models,
         stages=stages,
     )
-    lines = benchmark_lines(report)
+    lines = benchmark_lines(found)
     if stages:
-        lines += stage_lines(report["stages"], mode)
+        lines += stage_lines(found["stages"], mode)
     if against_script:
-        found = script.against_script(bundle, files, frames=frames, threads=threads, cache=models)
-        report["against_script"] = found
-        lines += script.script_lines(found)
+        turns = script.against_script(bundle, files, frames=frames, threads=threads, cache=models)
+        found["against_script"] = turns
+        lines += script.script_lines(turns)
     comparison = None
     if earlier is not None:
-        comparison = regressions.compared(str(compare), earlier, report, allowed)
-        report["comparison"] = comparison.as_report()
+        comparison = regressions.compared(str(compare), earlier, found, allowed)
+        found["comparison"] = comparison.as_report()
         lines += regressions.comparison_lines(comparison)
     if json_file is not None:
-        write_report(json_file, report)
+        write_report(json_file, found)
+    if report is not None:
+        write_text(str(report), bench_page.page(found))
     if json_file != "-":
         print(*lines, sep="\n")
-    _check_limits(report, max_p95_ms, max_rss_mib)
+    _check_limits(found, max_p95_ms, max_rss_mib)
     if comparison is not None:
         regressions.check(comparison)
 
 
 def _check_limits(
-    report: dict[str, Any], max_p95_ms: float | None, max_rss_mib: float | None
+    found: dict[str, Any], max_p95_ms: float | None, max_rss_mib: float | None
 ) -> None:
     """Raise GateError for a limit that is missed; written so that NaN is."""
-    p95, rss = report["latency_ms"]["total"]["p95"], report["memory_mib"]["peak_rss"]
+    p95, rss = found["latency_ms"]["total"]["p95"], found["memory_mib"]["peak_rss"]
     if max_p95_ms is not None and not p95 <= max_p95_ms:
         raise GateError(f"bench: expected p95 of at most {max_p95_ms:g} ms, found {p95:.3f} ms")
     if max_rss_mib is not None and not rss <= max_rss_mib:

@@ -78,7 +78,7 @@ app.command(
         "cvo-edge bench my-bundle",
         "cvo-edge bench my-bundle flight.mp4 --mode throughput --json bench.json",
         "cvo-edge bench my-bundle images/ --stages --against-script",
-        "cvo-edge bench my-bundle images/ --compare bench.json --max-p95-ms 40",
+        "cvo-edge bench my-bundle images/ --compare bench.json --report bench.html",
     )
 )(bench)
 

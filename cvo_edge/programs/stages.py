@@ -47,7 +47,7 @@ Path_ = tuple[str, ...]
 READ, ESTIMATE, CONCLUDE, WRITE = "read", "estimate", "conclude", "write"
 # The outermost stages: each is called once per frame, in whatever thread.
 ROOTS = (READ, ESTIMATE, CONCLUDE, WRITE)
-REST = "rest"
+ENGINE, REST = "engine", "rest"
 # Records are kept in a file meanwhile.
 MOST_FRAMES = 2000
 _BAR = 40
@@ -64,7 +64,7 @@ HOOKS: tuple[tuple[object, str, str], ...] = (
     (observation, "image_doubt", "image checks"),
     (KnownImages, "doubt", "image checks"),
     (Repetition, "doubts", "repetition"),
-    (Session, "run", "engine"),
+    (Session, "run", ENGINE),
     (observation, "_output_fault", "output checks"),
     (Observer, "_checked", "output checks"),
     (Odometer, "conformal_set", "set"),
@@ -271,10 +271,12 @@ def stage_lines(found: Mapping[str, Any], mode: str) -> Iterator[str]:
     """Yield the table, with a bar for each stage at its place within the frame."""
     rows = found["rows"]
     total_us = sum(row["mean_us"] for row in rows if "/" not in row["stage"])
+    engine_us = sum(row["mean_us"] for row in rows if row["stage"] == f"{ESTIMATE}/{ENGINE}")
     beside = " in several threads" if mode != "latency" else ""
     yield (
-        f"stages, {found['frames']} frames: {total_us:.0f} us of work per frame{beside}, a record "
-        f"every {found['record_every_us']:.0f} us"
+        f"stages, {found['frames']} frames: {total_us:.0f} us of work per frame{beside} "
+        f"({engine_us:.0f} in the engine, {total_us - engine_us:.0f} around it), a record every "
+        f"{found['record_every_us']:.0f} us"
     )
     yield f"{'us per frame':<22}{'mean':>9}{'p50':>9}{'p90':>9}{'share':>8}"
     for row, (begin, end) in zip(rows, places(rows), strict=True):

@@ -2,6 +2,7 @@
 
 import copy
 import json
+from html.parser import HTMLParser
 from inspect import getattr_static
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from cvo_edge import Odometer, open_source
 from cvo_edge.errors import BundleMismatchError, GateError, SourceError, UsageError
-from cvo_edge.programs import regressions, script, stages
+from cvo_edge.programs import bench_page, regressions, script, stages
 from cvo_edge.programs.bench import benchmark
 from cvo_edge.programs.cli import app
 
@@ -18,7 +19,7 @@ TOLERANCE = 0.15
 
 @pytest.fixture(scope="module")
 def report(bundle_dir, clip_dir):
-    found = benchmark(bundle_dir, str(clip_dir), frames=4, warmup=1)
+    found = benchmark(bundle_dir, str(clip_dir), frames=4, warmup=1, stages=True)
     turns = script.against_script(bundle_dir, str(clip_dir), frames=4, rounds=1)
     return {"software": "cvo-edge 1", **found, "against_script": turns}
 
@@ -201,3 +202,41 @@ def test_every_stage_is_found_and_nothing_stays_timed(artifacts_dir, clip_dir, m
     if mode == "latency":
         assert sum(row["mean_us"] for row in outermost) <= 1.001 * found["record_every_us"]
     assert len(list(stages.stage_lines(found, mode))) == len(found["rows"]) + 3
+
+
+class Opened(HTMLParser):
+    """Checks that every tag is closed in its place, and keeps the texts."""
+
+    def __init__(self):
+        super().__init__()
+        self.stack, self.texts = [], []
+
+    def handle_starttag(self, tag, attributes):
+        # What it shows is in the page itself.
+        assert not {"src", "href"} & {name for name, _ in attributes}
+        if tag != "meta":
+            self.stack.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.stack.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data.strip())
+
+
+def test_the_page_shows_every_part_of_a_report_and_any_name(tmp_path, report):
+    odd = {**report, "source": "<script>a & b</script>"}
+    comparison = compared(tmp_path, changed(odd, "ratio_to_raw median", 0.5), odd)
+    written = {**odd, "comparison": comparison.as_report()}
+    parser = Opened()
+    parser.feed(bench_page.page(written))
+    assert parser.stack == []
+    assert any("<script>a & b</script>" in text for text in parser.texts)
+    shown = {row["stage"].rpartition("/")[2] for row in report["stages"]["rows"]}
+    figures = {figure.name for figure in comparison.figures}
+    assert shown | figures | {"regression", "run, mode latency"} <= set(parser.texts)
+
+
+def test_a_page_is_named_as_one(bundle_dir):
+    with pytest.raises(UsageError, match=r"expected a name that ends in .html, found page.json"):
+        app(["bench", str(bundle_dir), "--report", "page.json"], standalone_mode=False)

@@ -22,6 +22,7 @@ FOREIGN = {
     # Our name in a document is no sign of our file, nor is a header that it quotes.
     "notes": b'# How to run cvo-edge\n\n{"software": "cvo-edge 0.1.0"}\n',
     "script": b"#!/bin/sh\ncvo-edge run my-bundle frames/ -o out.jsonl\n",
+    "page": b'<!doctype html>\n<html><head><title>content="cvo-edge 1"</title></head></html>\n',
     "json": b'{"name": "cvo-edge", "version": 1}\n',
     "picture": b"\x89PNG\r\n\x1a\n\x00\x00\x00\x0dIHDR cvo-edge",
 }
@@ -30,6 +31,7 @@ WRITERS = {
     ("run", "output"): f"run {BUNDLE} {CLIP} --max-frames 2 --quiet --fps 1 -o OUT",
     ("demo", "picture"): "demo --picture OUT",
     ("bench", "json_file"): f"bench {BUNDLE} --frames 1 --warmup 0 --no-cache --json OUT",
+    ("bench", "report"): f"bench {BUNDLE} --frames 1 --warmup 0 --no-cache --report OUT",
     (
         "odometry",
         "output",
@@ -51,6 +53,7 @@ SUFFIXES = {
     ("annotate", "output"): (".jsonl", ".csv", ".tum"),
     ("convert", "output"): (".jsonl", ".csv", ".tum", ".mcap", ".rrd"),
     ("dataset", "picture"): (".svg",),
+    ("bench", "report"): (".html",),
 }
 # A service adds to its file and replaces none.
 ADDED_TO = {("serve", "output"): f"serve {BUNDLE} /dev/video9 -o OUT"}
@@ -91,7 +94,7 @@ def given(tmp_path_factory):
 
 def names(app):
     """Return command and option of all that an app's commands can write to."""
-    written = re.compile("^(output|out|json_file|picture)$")
+    written = re.compile("^(output|out|json_file|picture|report)$")
     return {
         (name, each.name)
         for name, command in typer.main.get_command(app).commands.items()
