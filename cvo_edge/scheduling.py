@@ -163,8 +163,13 @@ def in_order(tasks: Iterable[Callable[[], Result]], workers: int) -> Generator[R
     """Run tasks in ``workers`` threads and yield their results in order.
 
     Tasks are fetched on demand, so only a few are pending at a time. An error of a task, or of the
-    iterable itself, is raised after the results of the tasks before it.
+    iterable itself, is raised after the results of the tasks before it. A single worker is the
+    calling thread: on one core another one would only be waited for.
     """
+    if workers == 1:
+        for task in tasks:
+            yield task()
+        return
     pending: deque[Future[Result]] = deque()
     pool = ThreadPoolExecutor(workers, "cvo-edge worker")
     try:

@@ -60,7 +60,12 @@ def test_few_tasks_are_under_way_and_none_after_the_last_one_wanted():
     assert len(taken) <= 5 + 2 + 2
 
 
-def test_an_error_comes_in_its_place():
+def test_a_single_worker_is_the_calling_thread():
+    assert list(in_order([threading.get_ident] * 3, 1)) == [threading.get_ident()] * 3
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_comes_in_its_place(workers):
     def fails():
         raise ValueError("third")
 
@@ -68,12 +73,12 @@ def test_an_error_comes_in_its_place():
         yield from (lambda: 1, lambda: 2)
         raise error
 
-    results = in_order([lambda: 1, lambda: 2, fails, lambda: 4], 2)
+    results = in_order([lambda: 1, lambda: 2, fails, lambda: 4], workers)
     assert [next(results), next(results)] == [1, 2]
     with pytest.raises(ValueError, match="third"):
         next(results)
     for error in (SourceError("ended early"), KeyError("ended early")):
-        results = in_order(ending(error), 2)
+        results = in_order(ending(error), workers)
         assert [next(results), next(results)] == [1, 2]
         with pytest.raises(type(error), match="ended early"):
             next(results)
