@@ -2,13 +2,14 @@
 
     python bench/networks.py
 
-The networks are briefly trained (100 steps of their heads, no pretrained weights): they take the
-time of trained ones, but their poses are useless. Everything is kept in ``build/bench`` and reused.
+The networks are briefly trained (100 steps, no pretrained weights): they take the time of trained
+ones, but their poses are useless. SCR's end at stride 16, where its cells are. Everything is kept in ``build/bench`` and reused.
 The trained bundles are those in ``calibration_artifacts``.
 """
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from itertools import product
@@ -26,17 +27,20 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parent.parent
 WORK = ROOT / "build" / "bench"
 ARTIFACTS = ROOT / "calibration_artifacts"
+# Those that regress a pose, and those with a demonstration bundle.
 METHODS = ("cjp", "cqr", "csp", "mcqr")
-# Those with a demonstration bundle; SCR has no form with a whole backbone.
 DEMONSTRATED = ("scr", *METHODS)
 BACKBONES = ("mobilenetv2_100", "resnet34")
 PRECISIONS = ("fp32", "int8")
 ROOM = "synthetic:room,flights=20,frames=20"
 FRAMES = "synthetic:room,flights=1,frames=50,size=640x480,seed=1"
-_WHOLE = "--stages final --grid 1x1 --crop centre"
+_CROP = "--crop centre"
+_WHOLE = "--stages final --grid 1x1"
 # A cropped frame of 640x480, halved.
 HALVED = "240x240"
 _UNTRAINED = "--split random --steps 100 --copies 0"
+# Cells must agree on a pose, or none of its frames has an interval.
+_CELLS = "--cell-steps 200"
 
 
 def whole_bundle(
@@ -48,7 +52,9 @@ def whole_bundle(
 ) -> Path:
     """Return a bundle of a whole, briefly trained network, made if it does not exist."""
     name = f"{method}-{backbone}" if size == "224x224" else f"{method}-{backbone}-{size}"
-    options = f"--backbone {backbone} {_WHOLE} --size {size} --weights {_random_weights(backbone)}"
+    part = _CELLS if method == "scr" else _WHOLE
+    options = f"--backbone {backbone} {part} {_CROP} --size {size}"
+    options = f"{options} --weights {_random_weights(backbone)}"
     run, bundle = WORK / "runs" / name, WORK / f"{name}-{precision}"
     if provider != "onnxruntime":
         bundle = bundle.with_name(f"{bundle.name}-{provider}")
@@ -108,6 +114,21 @@ def frames() -> list[Path]:
     return sorted(folder.glob("*.jpg"))
 
 
+def frames_as(form: str, count: int = 50) -> Path:
+    """Return a folder of the first of these frames: ``jpg``, or the same pixels as ``bmp``."""
+    folder = WORK / f"frames-{form}-{count}"
+    if not folder.exists():
+        partial = folder.with_suffix(".partial")
+        partial.mkdir(parents=True, exist_ok=True)
+        for path in frames()[:count]:
+            if form == path.suffix[1:]:
+                shutil.copyfile(path, partial / path.name)
+            else:
+                cv2.imwrite(str(partial / f"{path.stem}.{form}"), cv2.imread(str(path)))
+        partial.rename(folder)
+    return folder
+
+
 def images() -> list[np.ndarray]:
     """Return the same frames decoded, (480, 640, 3) uint8 BGR."""
     return [cv2.imread(str(path)) for path in frames()]
@@ -128,7 +149,7 @@ def _cvo_export(*arguments: str) -> None:
 def main() -> None:
     """Make all of them."""
     frames()
-    for method, backbone, precision in product(METHODS, BACKBONES, PRECISIONS):
+    for method, backbone, precision in product(DEMONSTRATED, BACKBONES, PRECISIONS):
         print(whole_bundle(method, backbone, precision).name, flush=True)
     for backbone in BACKBONES:
         print(whole_bundle("cjp", backbone, size=HALVED).name, flush=True)
