@@ -1,139 +1,130 @@
-"""Compare this checkout with another, turn by turn: array to interval over the bare model call.
+"""Compare this checkout with another, turn by turn: from an array to the interval.
 
-    python bench/against.py OTHER_CHECKOUT [ROUNDS]
+    python bench/against.py CHECKOUT [--methods METHOD ...] [--rounds N]
 
-Each checkout runs in its own process; the processes alternate every few frames, so that a change of
-the machine's speed affects both. A turn times the step from an image array to the interval and the
-bare call of the session on the same input. The result goes to ``results/speed/against.json``.
+Every method on a whole MobileNetV2 and ResNet34, in float32 and 8 bits. Each checkout runs in
+processes of its own, on two cores and on one, which take turns of a few frames. A turn times the
+step from an image array of 640x480 to the interval and, in turns with it, the bare call of the
+session on the same input. ``bench/files.py --against`` compares files to records.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
+import argparse
+from contextlib import ExitStack
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from networks import ARTIFACTS, METHODS
-from provenance import RESULTS, ROOT, write_result
+from networks import BACKBONES, DEMONSTRATED, PRECISIONS, frames_as, whole_bundle
+from provenance import ROOT
+from rounds import figures, in_turn, write_report
+from workers import Worker, commit_of
 
-ROUNDS, FRAMES, WARM_UP = 60, 10, 3
+CORES = (2, 1)
+WARM_UP, FRAMES = 2, 8
+ROUNDS = 25
+SLOW_ROUNDS = 15
 
-# What a process does: one line of JSON out for each line in. It imports no more than both have.
-_WORKER = """
-import json, sys
+# Bundle, folder, cores, frames a turn.
+_STEPS = """
 from time import perf_counter
-from cvo_edge import Odometer, open_source
-bundle, clip, frames = sys.argv[1], sys.argv[2], int(sys.argv[3])
-images = [frame.image for frame in open_source(clip)]
-odometer = Odometer.load(bundle)
+import numpy
+from cvo_edge.input import preprocess
+from cvo_edge.input.sources import open_source
+from cvo_edge.odometer import Odometer
+bundle, folder, cores, frames = sys.argv[1:]
+images = [frame.image for frame in open_source(folder)]
+odometer = Odometer.load(bundle, threads=int(cores))
 session, inputs = odometer.session, odometer.calibration.preprocess
-from importlib import import_module
-try:
-    preprocess = import_module("cvo_edge.input.preprocess")
-except ModuleNotFoundError:
-    preprocess = import_module("cvo_edge.preprocess")
-number = 0
-for _ in sys.stdin:
+kept, number = numpy.empty_like(images[0]), 0
+def answer(what):
+    global number
     steps, calls = [], []
-    for _ in range(frames):
-        image = images[number % len(images)]
+    for _ in range(int(frames)):
+        # As a camera or a decoder leaves it; no picture comes again within a second.
+        numpy.copyto(kept, images[number % len(images)])
         number += 1
-        tensor = preprocess.model_input(image, inputs.height, inputs.width, inputs.crop)
+        begin = perf_counter()
+        estimate = odometer.step(kept)
+        steps.append(perf_counter() - begin)
+        if not estimate.bounded:
+            raise SystemExit(f"{bundle}: expected an interval, found {estimate.reasons}")
+        tensor = preprocess.model_input(kept, inputs.height, inputs.width, inputs.crop)
         feeds = {"image": tensor, **odometer.head.extra_inputs(number)}
         begin = perf_counter()
-        odometer.step(image)
-        middle = perf_counter()
         session.run(feeds)
-        end = perf_counter()
-        steps.append(middle - begin)
-        calls.append(end - middle)
-    print(json.dumps([steps, calls]), flush=True)
+        calls.append(perf_counter() - begin)
+    return [1e3 * float(numpy.median(each)) for each in (steps, calls)]
 """
 
 
-class Checkout:
-    """One checkout's process, which measures a turn when it is asked to."""
-
-    def __init__(self, folder: Path, bundle: Path) -> None:
-        arguments = [str(bundle), str(ARTIFACTS / "synthetic-room-clip"), str(FRAMES)]
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", _WORKER, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=folder,
-            env={**os.environ, "PYTHONPATH": str(folder)},
-        )
-        self.ratios: list[float] = []
-        self.around_ms: list[float] = []
-
-    def turn(self, counts: bool) -> None:
-        """Measure one turn; keep its medians where it counts."""
-        stdin, stdout = self._process.stdin, self._process.stdout
-        if stdin is None or stdout is None:
-            raise RuntimeError("expected pipes to the process")
-        stdin.write("\n")
-        stdin.flush()
-        steps, calls = json.loads(stdout.readline())
-        if counts:
-            self.ratios.append(float(np.median(steps) / np.median(calls)))
-            self.around_ms.append(1e3 * float(np.median(steps) - np.median(calls)))
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.communicate()
-
-
-def compared(other: Path, bundle: Path, rounds: int) -> dict[str, dict[str, float]]:
-    """Return the medians of both checkouts on one bundle."""
-    pair = {"this": Checkout(ROOT, bundle), "other": Checkout(other, bundle)}
-    try:
-        for number in range(WARM_UP + rounds):
-            names = list(pair) if number % 2 else list(pair)[::-1]
-            for name in names:
-                pair[name].turn(counts=number >= WARM_UP)
-    finally:
-        for checkout in pair.values():
-            checkout.close()
-    return {
-        name: {
-            "ratio_to_raw": round(float(np.median(checkout.ratios)), 4),
-            "around_the_network_ms": round(float(np.median(checkout.around_ms)), 4),
+def measured(bundle: Path, rounds: int, other: Path) -> dict[str, Any]:
+    """Time one bundle on both checkouts -> figures by cores and checkout."""
+    folder = frames_as("jpg")
+    checkouts = {"now": ROOT, "before": other}
+    with ExitStack() as stack:
+        workers = {
+            (cores, name): stack.enter_context(
+                Worker(_STEPS, [bundle, folder, cores, FRAMES], cores, checkout)
+            )
+            for cores, (name, checkout) in product(CORES, checkouts.items())
         }
-        for name, checkout in pair.items()
-    }
+        turns: dict[tuple[int, str], list[list[float]]] = {key: [] for key in workers}
+        for number in range(WARM_UP + rounds):
+            for key in in_turn(list(workers), number):
+                turns[key].append(workers[key].turn())
+    spent = {key: np.array(rows[WARM_UP:]).T for key, rows in turns.items()}
+    found: dict[str, Any] = {}
+    for cores in CORES:
+        row = found[str(cores)] = {
+            name: {
+                "ms": {"step": figures(step), "raw": figures(raw)},
+                "step_over_raw": figures(step / raw),
+                "step_minus_raw_ms": figures(step - raw),
+            }
+            for name in checkouts
+            for step, raw in [spent[cores, name]]
+        }
+        now, before = spent[cores, "now"], spent[cores, "before"]
+        row["step_now_over_before"] = figures(now[0] / before[0])
+        row["around_now_over_before"] = figures((now[0] - now[1]) / (before[0] - before[1]))
+    return found
+
+
+def line(found: dict[str, Any]) -> str:
+    """Return one bundle's figures as text."""
+    parts = []
+    for cores, row in found.items():
+        around = " -> ".join(
+            f"{row[name]['step_minus_raw_ms']['median']:.3f} "
+            f"(p10 {row[name]['step_minus_raw_ms']['p10']:.3f})"
+            for name in ("before", "now")
+        )
+        over = row["step_now_over_before"]["median"]
+        parts.append(f"{cores} cores: less the raw call {around} ms, step {over:.3f} x")
+    return "; ".join(parts)
 
 
 def main() -> None:
-    """Compare on the float32 demonstration bundle of each method."""
-    other = Path(sys.argv[1]).resolve()
-    rounds = int(sys.argv[2]) if len(sys.argv) > 2 else ROUNDS
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short=12", "HEAD"],
-        cwd=other,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.strip()
+    """Compare on all bundles, or on those of the methods that are named."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("checkout", type=Path)
+    parser.add_argument("--methods", nargs="+", default=DEMONSTRATED, choices=DEMONSTRATED)
+    parser.add_argument("--rounds", type=int, help="for a quick look, which writes no result")
+    arguments = parser.parse_args()
+    other = arguments.checkout.resolve()
     results: dict[str, Any] = {}
-    for method in METHODS:
-        results[method] = compared(other, ARTIFACTS / f"synthetic-room-{method}", rounds)
-        print(method, results[method], flush=True)
-    write_result(
-        RESULTS / "speed" / "against.json",
-        {
-            # The other checkout's folder says nothing; its commit does.
-            "command": f"python bench/against.py OTHER_CHECKOUT {rounds}",
-            "other_commit": commit,
-            "rounds": rounds,
-            "frames_a_turn": FRAMES,
-            "results": results,
-        },
-    )
+    for method, backbone, precision in product(arguments.methods, BACKBONES, PRECISIONS):
+        slow = (backbone, precision) == ("resnet34", "fp32")
+        rounds = arguments.rounds or (SLOW_ROUNDS if slow else ROUNDS)
+        found = measured(whole_bundle(method, backbone, precision), rounds, other)
+        results.setdefault(backbone, {}).setdefault(method, {})[precision] = found
+        print(f"{backbone:<16} {method:<5} {precision} {line(found)}", flush=True)
+    if arguments.rounds is None and set(arguments.methods) == set(DEMONSTRATED):
+        settings = {"rounds": ROUNDS, "slow_rounds": SLOW_ROUNDS, "frames_a_turn": FRAMES}
+        write_report("against", results, before=commit_of(other), **settings)
 
 
 if __name__ == "__main__":

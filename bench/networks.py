@@ -3,8 +3,8 @@
     python bench/networks.py
 
 The networks are briefly trained (100 steps, no pretrained weights): they take the time of trained
-ones, but their poses are useless. SCR's end at stride 16, where its cells are. Everything is kept in ``build/bench`` and reused.
-The trained bundles are those in ``calibration_artifacts``.
+ones, but their poses are useless. SCR's end at stride 16, where its cells are. Everything is kept
+in ``build/bench`` and reused. The trained bundles are those in ``calibration_artifacts``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _WHOLE = "--stages final --grid 1x1"
 HALVED = "240x240"
 _UNTRAINED = "--split random --steps 100 --copies 0"
 # Cells must agree on a pose, or none of its frames has an interval.
-_CELLS = "--cell-steps 200"
+_CELLS = "--cell-steps 40"
 
 
 def whole_bundle(

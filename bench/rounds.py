@@ -72,12 +72,13 @@ def just_written(
 
 
 def figures(values: Array) -> dict[str, float]:
-    """Median and 95th percentile, four digits."""
-    return {"median": _four(np.median(values)), "p95": _four(np.percentile(values, 95))}
+    """Median, 10th and 95th percentile, four digits."""
+    low, middle, high = np.percentile(values, (10, 50, 95))
+    return {"median": _four(middle), "p10": _four(low), "p95": _four(high)}
 
 
 def ratio(numerator: Array, denominator: Array) -> dict[str, float]:
-    """Return median and 95th percentile of the ratio within a round."""
+    """Return the figures of the ratio within a round."""
     return figures(numerator / denominator)
 
 
