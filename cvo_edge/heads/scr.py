@@ -23,6 +23,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
+import cv2
 import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace
@@ -175,10 +176,11 @@ class ScrHead(Head):
             )
 
     def solver(self, seen: SeenCamera | None) -> Solver | None:
-        """As ``Head``: adds ``pose`` (1, 7), ``scale`` (1, 6, 6), ``signs`` (1, 2) and the rest.
+        """As ``Head``: adds ``pose`` (1, 7), ``signs`` (1, 2) and the rest.
 
-        ``solved_pose`` (1, 7) is the solver's, which fusion may change; ``lens_gradient`` (1, 3)
-        and ``lens_information`` (1, 3, 3) are evidence for the camera check.
+        ``covariance`` (1, 6, 6) is that of the errors; ``solved_pose`` (1, 7) is the solver's,
+        which fusion may change; ``lens_gradient`` (1, 3) and ``lens_information`` (1, 3, 3) are
+        evidence for the camera check.
         """
         seen = _stated(seen)
         pose_solver, limits = self._pose_solver(seen), self.parameters.limits
@@ -186,36 +188,38 @@ class ScrHead(Head):
         steps = (1,) if seen.learned else (1, _CONVERGED_STEPS)
         focal_px, cells = seen.camera.focal_px, math.prod(self.parameters.grid)
         count = max(1, round(min(BEST_CELLS, cells) * pose_solver.seen.mean()))
+        whole = bool(pose_solver.seen.all())
 
         def solve(outputs: Mapping[str, NDArray[Any]]) -> Solved:
-            log_scale = outputs["log_scale_px"][0].astype(np.float64)
-            scale_px = np.exp(np.clip(log_scale, -_LARGEST_LOG, _LARGEST_LOG))
-            points, scale = outputs["coordinates"][0], scale_px / focal_px
-            found = pose_solver.solve(points, scale)
-            lens = pose_solver.lens_evidence(points, scale, found.pose)
-            shown = np.where(pose_solver.seen, scale_px, np.inf)
-            best = np.argpartition(shown, count - 1)[:count]
+            log_scale = outputs["log_scale_px"][0]
+            within = np.minimum(np.maximum(log_scale, -_LARGEST_LOG), _LARGEST_LOG)
+            scale = np.exp(within, dtype=np.float64) / focal_px
+            found = pose_solver.solve(outputs["coordinates"][0], scale)
+            shown = log_scale if whole else np.where(pose_solver.seen, log_scale, np.inf)
+            best = shown.argpartition(count - 1)[:count]
             squared = found.squared[best]
-            error_px = math.sqrt(np.median(squared * np.square(scale_px[best])))
+            error_px = focal_px * math.sqrt(_median(squared * np.square(scale[best])))
             contradicting = np.count_nonzero(squared > _CONTRADICTS**2) / count
-            factor = max(dispersion(found.squared[pose_solver.seen], n) for n in steps)
+            seen_squared = found.squared if whole else found.squared[pose_solver.seen]
+            factor = max(dispersion(seen_squared, n) for n in steps)
             found = found._replace(information=found.information / factor)
             pose, information, added = self.combined(outputs, found, seen)
-            scale_of_errors = _lower_triangular(np.asarray(np.linalg.inv(information)))
+            # Without full information, there is no covariance.
+            certain, covariance = cv2.invert(information, flags=cv2.DECOMP_CHOLESKY)
             solved = {
                 **outputs,
                 **added,
                 "pose": pose[np.newaxis],
-                "scale": scale_of_errors[np.newaxis],
+                "covariance": covariance[np.newaxis],
                 "signs": np.array([[error_px, contradicting]]),
                 "solved_pose": found.pose[np.newaxis],
-                "lens_gradient": lens.gradient[np.newaxis],
-                "lens_information": lens.information[np.newaxis],
+                "lens_gradient": found.lens.gradient[np.newaxis],
+                "lens_information": found.lens.information[np.newaxis],
             }
             # Written so that NaN is strange.
             strange = (
                 not found.last_step < _CONVERGED
-                or not np.isfinite(scale_of_errors).all()
+                or not certain
                 or (
                     limits is not None
                     and not (error_px <= limits.error_px and contradicting <= limits.contradicting)
@@ -296,8 +300,8 @@ class ScrHead(Head):
         return LinearScale(np.ones(scores.shape[1:]))
 
     def scored_outputs(self) -> Collection[str]:
-        """As ``Head``: the scale of the errors, without the cells."""
-        return ("scale",)
+        """As ``Head``: the covariance of the errors, without the cells."""
+        return ("covariance",)
 
     def plain_scores(
         self,
@@ -307,9 +311,9 @@ class ScrHead(Head):
         scope: Scope = "marginal",
     ) -> Array:
         """Outputs stacked over n frames, point and truth (n, 6) -> scores (n, 1, 6)."""
-        scale, deviation = self._floored(outputs["scale"])
-        error = truth - point
+        deviation, error = self._deviations(outputs), truth - point
         if scope == "joint":
+            scale = self._scales(outputs)
             distance = scaled_distance(np.zeros((len(error), 1, 6)), scale, error)
             return np.tile(distance[:, np.newaxis, np.newaxis], (1, 1, 6))
         return np.asarray(np.abs(error) / deviation)[:, np.newaxis]
@@ -319,16 +323,16 @@ class ScrHead(Head):
     ) -> ConformalSet:
         """Outputs and point (6,) of one frame -> six intervals, or an ellipsoid and its hull."""
         q_hat = infinite_where_null(threshold.q_hat)
-        scale, deviation = self._floored(outputs["scale"])
+        deviation = self._deviations(outputs)[0]
         if threshold.scope == "marginal":
-            reach = q_hat * deviation[0]
+            reach = q_hat * deviation
             return ConformalSet(point - reach, point + reach)
-        radius = float(q_hat[0])
-        if radius == np.inf:
+        radius, scale = float(q_hat[0]), self._scales(outputs)[0]
+        if radius == np.inf or not np.isfinite(scale).all():
             return unbounded_set()
         # Slightly enlarged, so that rounding leaves no point of the ellipsoid outside its hull.
-        reach = radius * deviation[0] * (1.0 + _HAIR) + _HAIR * np.abs(point)
-        ellipsoid = Ellipsoids(point[np.newaxis], scale[0], radius)
+        reach = radius * deviation * (1.0 + _HAIR) + _HAIR * np.abs(point)
+        ellipsoid = Ellipsoids(point[np.newaxis], scale, radius)
         return ConformalSet(point - reach, point + reach, ellipsoids=ellipsoid)
 
     def candidates(self) -> tuple[Candidate, ...]:
@@ -353,11 +357,19 @@ class ScrHead(Head):
         """As ``Head``."""
         return "Mahalanobis distance under the solver's covariance"
 
-    def _floored(self, scale: NDArray[Any]) -> tuple[Array, Array]:
-        """Scales (..., 6, 6) -> scales with enlarged rows, and deviations (..., 6)."""
-        deviation = np.sqrt(np.square(scale).sum(axis=-1))
-        floored = np.maximum(deviation, self._floor)
-        return scale * (floored / deviation)[..., np.newaxis], floored
+    def _deviations(self, outputs: Mapping[str, NDArray[Any]]) -> Array:
+        """Return the deviations of the errors of n frames, at least the floor, (n, 6)."""
+        variance = outputs["covariance"].diagonal(axis1=1, axis2=2)
+        return np.asarray(np.maximum(np.sqrt(variance), self._floor))
+
+    def _scales(self, outputs: Mapping[str, NDArray[Any]]) -> Array:
+        """Return the Cholesky factors of n covariances, (n, 6, 6), NaN for an indefinite one.
+
+        The floor enlarges their rows.
+        """
+        scales = np.array([_lower_triangular(each) for each in outputs["covariance"]])
+        length = np.sqrt(np.square(scales).sum(axis=-1, keepdims=True))
+        return np.asarray(scales * np.maximum(1.0, self._floor[:, np.newaxis] / length))
 
 
 def _stated(seen: SeenCamera | None) -> SeenCamera:
@@ -366,6 +378,12 @@ def _stated(seen: SeenCamera | None) -> SeenCamera:
             "camera: expected intrinsics, which the solver needs, found null"
         )
     return seen
+
+
+def _median(values: Array) -> float:
+    """Return the median of values (n,), which it sorts; numpy's takes ten times as long."""
+    values.sort()
+    return 0.5 * float(values[(len(values) - 1) // 2] + values[len(values) // 2])
 
 
 def _lower_triangular(covariance: Array) -> Array:

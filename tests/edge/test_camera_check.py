@@ -14,7 +14,8 @@ from cvo_edge.camera_check import (
     in_deviations,
     summed,
 )
-from cvo_edge.pose_solver import NU, PoseSolver
+from cvo_edge.pose_solver import PoseSolver
+from cvo_edge.reprojection import NU
 
 START = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
 FOCAL_PX = 240.0
@@ -52,7 +53,7 @@ def seen_by(lens, generator, noise=0.002):
 
 
 def outputs_of(points, scale, pose):
-    evidence = solver().lens_evidence(points, scale, pose)
+    evidence = solver().solve(points, scale).lens
     return {
         "coordinates": points[np.newaxis],
         "log_scale_px": np.log(scale * FOCAL_PX)[np.newaxis],
@@ -70,7 +71,7 @@ def check(limits=LIMITS, **options):
 def test_evidence_is_the_derivative_of_the_profiled_likelihood(optimize):
     # Oracle: scipy fits the pose again for a slightly different camera.
     points, scale, pose = seen_by(np.zeros(3), np.random.default_rng(0))
-    evidence = solver().lens_evidence(points, scale, pose)
+    evidence = solver().solve(points, scale).lens
 
     def loss(step, lens):
         q = geometry.quaternion_multiply(pose[3:], geometry.quaternion_exp(step[3:]))

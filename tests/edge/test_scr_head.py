@@ -109,7 +109,7 @@ def test_a_frame_that_errs_more_than_it_says_is_less_certain():
             outputs = outputs_of(camera, pose_near(generator), generator, noise_px=0.2 * factor)
             outputs["log_scale_px"][:] = np.log(0.2)
             solve = ScrHead(PARAMETERS, "normalised").solver(seen(camera))
-            deviations.append(np.sqrt(np.square(solve(outputs).outputs["scale"][0]).sum(axis=1)))
+            deviations.append(np.sqrt(np.diag(solve(outputs).outputs["covariance"][0])))
         ratios.append(deviations[1] / deviations[0])
     # The weights alone widen it 1.7 times.
     assert (ratios[0] > 2.3).all()
@@ -224,7 +224,7 @@ def test_the_set_holds_exactly_the_poses_with_a_smaller_score(scope, floor):
     for _ in range(50):
         outputs = solve(outputs_of(CAMERA, pose_near(generator), generator)).outputs
         found = head.conformal_set(outputs, point, threshold)
-        deviation = np.maximum(np.sqrt(np.square(outputs["scale"][0]).sum(axis=1)), floor)
+        deviation = np.maximum(np.sqrt(np.diag(outputs["covariance"][0])), floor)
         y = point + generator.normal(0.0, 1.5, 6) * deviation
         scores = head.scores(outputs, point[np.newaxis], y[np.newaxis], scope)[0, 0]
         if scope == "marginal":
@@ -352,13 +352,13 @@ def test_the_solver_alone_is_as_certain_as_val_has_shown():
     outputs = outputs_of(OTHER, pose_near(generator), generator)
     outputs["regression"] = np.zeros((1, 7), np.float32) + np.float32([0, 0, 0, 0, 0, 0, 1])
     outputs["half_width"] = np.full((1, 6), 0.01, np.float32)
-    scales = [
+    covariances = [
         FusedHead(msgspec.structs.replace(FUSED, fusion=each), "normalised")
         .solver(seen(OTHER))(outputs)
-        .outputs["scale"]
+        .outputs["covariance"]
         for each in (None, fusion)
     ]
-    np.testing.assert_allclose(scales[1], scales[0] / np.sqrt(0.04))
+    np.testing.assert_allclose(covariances[1], covariances[0] / 0.04)
 
 
 def test_disagreement_widens_the_covariance():

@@ -28,7 +28,8 @@ from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_edge.heads import Candidate
 from cvo_edge.heads.scr import ScrParameters
 from cvo_edge.pose import Chart
-from cvo_edge.pose_solver import NU, PoseSolver
+from cvo_edge.pose_solver import PoseSolver
+from cvo_edge.reprojection import NU
 from cvo_export.bundles.draft import six
 from cvo_export.data.augment import AugmentConfig
 from cvo_export.data.place import (
