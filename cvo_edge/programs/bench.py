@@ -137,7 +137,7 @@ def _measured(
         "method": calibration.method,
         "precision": calibration.model.precision,
         "provider": calibration.model.provider,
-        "source": None if source is None else shown(source),
+        "source": None if source is None else _name(source),
         "mode": odometer.mode,
         "frames": frames,
         "frames_valid": found.valid,
@@ -155,6 +155,11 @@ def _measured(
         "memory_mib": memory_mib(),
         "environment": environment(odometer.threads),
     }
+
+
+def _name(source: str) -> str:
+    """Return a source's name, the same for every way to write its path."""
+    return shown(source if "://" in source else os.path.normpath(source))
 
 
 def _steps(

@@ -9,6 +9,7 @@ import typer
 
 from cvo_edge.errors import GateError, UsageError
 from cvo_edge.files import check_output, write_report, write_text
+from cvo_edge.process import say
 from cvo_edge.programs.options import (
     REPORT,
     BundleArgument,
@@ -134,6 +135,7 @@ def bench(
     if stages:
         lines += stage_lines(found["stages"], mode)
     if against_script:
+        say(script.announcement(files, frames, found["throughput_fps"]))
         turns = script.against_script(bundle, files, frames=frames, threads=threads, cache=models)
         found["against_script"] = turns
         lines += script.script_lines(turns)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from cvo_edge.bundle.format import MODEL_FILE
 from cvo_edge.engine.cores import checked_threads
 from cvo_edge.engine.model_cache import ModelCache
-from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.errors import SinkError, SourceError, UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.input.capture import shown
 from cvo_edge.input.image_files import ImageFiles
@@ -65,6 +65,18 @@ def check_read_again(source: str | None) -> str:
     if names_camera(source) or names_pipe(source):
         raise UsageError(f"{expected}, found a camera or pipe: {shown(source)}")
     return source
+
+
+def announcement(source: str, frames: int | None, fps: float) -> str:
+    """Return how long the passes take, from the rate of one of the modes."""
+    passes, length = (1 + len(COMPARED)) * (WARM_UP + ROUNDS), open_source(source).length
+    counts = [count for count in (length, frames) if count is not None]
+    if not counts:
+        return f"{passes} passes over the source"
+    return (
+        f"{passes} passes over {min(counts)} frames, about {passes * min(counts) / fps:.0f} s; "
+        "--frames takes fewer"
+    )
 
 
 def against_script(
@@ -185,7 +197,13 @@ def _script(
                     first.append(perf_counter() - begin)
         return _passed(count, begin, first)
 
-    return run
+    def whole() -> Passed:
+        try:
+            return run()
+        except OSError as error:
+            raise SinkError(f"{target}: cannot be written: {error.strerror}") from None
+
+    return whole
 
 
 def _passed(frames: int, begin: float, first: list[float]) -> Passed:

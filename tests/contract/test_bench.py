@@ -19,7 +19,8 @@ TOLERANCE = 0.15
 
 @pytest.fixture(scope="module")
 def report(bundle_dir, clip_dir):
-    found = benchmark(bundle_dir, str(clip_dir), frames=4, warmup=1, stages=True)
+    found = benchmark(bundle_dir, f"{clip_dir}/.", frames=4, warmup=1, stages=True)
+    assert found["source"] == str(clip_dir)
     turns = script.against_script(bundle_dir, str(clip_dir), frames=4, rounds=1)
     return {"software": "cvo-edge 1", **found, "against_script": turns}
 
