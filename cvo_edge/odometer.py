@@ -27,6 +27,7 @@ from cvo_edge.estimate import Drift, PoseInterval
 from cvo_edge.given import given_path
 from cvo_edge.input.clock import SYSTEM_CLOCK
 from cvo_edge.input.frame import Frame, checked_hint
+from cvo_edge.input.half import halve
 from cvo_edge.monitor.adaptation import Adaptation
 from cvo_edge.monitor.labelled import Labelled
 from cvo_edge.monitor.watch import StreamWatch
@@ -267,10 +268,13 @@ class Odometer(Labelled):
         The stream checks start again. You may overwrite an image after requesting the next one.
         ``moving`` is as for ``step``, for the frames that do not say it themselves.
 
-        Raises the source's errors; raises UsageError for a path instead of a source and, in
-        ``live`` mode, for a recording without stamps.
+        Raises the source's errors; raises UsageError for a path instead of a source, in ``live``
+        mode for a recording without stamps, and for a source that cannot give what a bundle of
+        ``decode: half`` needs, JPEG images.
         """
         moving = checked_hint(moving)
+        if self.calibration.preprocess.decode == "half":
+            halve(frames)
         self._watch = StreamWatch(self._observer, self.calibration)
         work = partial(self._process, moving=moving, beside_others=self.mode == "throughput")
         with closing(

@@ -38,6 +38,7 @@ class Reason(StrEnum):
     IMAGE_SIZE_CHANGED = "image_size_changed"  # degraded: not the size of the stream's first frame
     CAMERA_DIFFERS = "camera_differs"  # degraded: the images are not those of the known camera
     IMAGE_TOO_SMALL = "image_too_small"  # degraded: fewer pixels than calibration images and model
+    IMAGE_NOT_HALF = "image_not_half"  # degraded: not half the size of the calibration images
     IMAGE_GREY = "image_grey"  # degraded: no colour, unlike the calibration images
     IMAGE_UNFAMILIAR = "image_unfamiliar"  # degraded: does not show the place the network knows
     IMAGE_DEGRADED = "image_degraded"  # degraded: noisier or poorer than any calibrated image

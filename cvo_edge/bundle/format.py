@@ -10,9 +10,9 @@ from msgspec import Meta, Struct
 
 from cvo_edge.camera import LEAST_SIDE, Camera
 from cvo_edge.documents import one_line
-from cvo_edge.errors import CalibrationFileError
+from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.pose import Rotation
-from cvo_edge.vocabulary import Crop, Joint, Precision, Provider, Rule, Scope, SplitKind
+from cvo_edge.vocabulary import Crop, Decode, Joint, Precision, Provider, Rule, Scope, SplitKind
 
 CALIBRATION_FILE = "calibration.json"
 MODEL_FILE: Literal["model.onnx"] = "model.onnx"
@@ -85,11 +85,13 @@ class ModelSpec(_Strict, frozen=True, omit_defaults=True):
     provider: Provider = "onnxruntime"
 
 
-class PreprocessSpec(_Strict, frozen=True):
+class PreprocessSpec(_Strict, frozen=True, omit_defaults=True):
     """Conversion of a camera image to the model's input; ``in_graph`` lists steps in the model.
 
     The model computes (value - mean) / std per channel, in RGB order and NCHW layout. ``mean`` and
     ``std`` are null for a network supplied as an ONNX file that contains its own normalisation.
+    ``decode``: ``half`` for JPEG images that are decoded to half their height and width; thresholds
+    are then valid for those pixels only.
     """
 
     height: Annotated[int, Meta(ge=16, le=4096)]
@@ -101,6 +103,15 @@ class PreprocessSpec(_Strict, frozen=True):
     std: tuple[Positive, Positive, Positive] | None
     layout: Literal["nhwc"]
     in_graph: tuple[Literal["cast"], Literal["transpose"], Literal["normalise"]]
+    decode: Decode = "full"
+
+    def check_halves(self, height: int, width: int) -> None:
+        """Raise UsageError unless half an image is whole pixels, and as many as the model needs."""
+        if height % 2 or width % 2 or height < 2 * self.height or width < 2 * self.width:
+            raise UsageError(
+                "decode: expected images with even sides, at least twice the model's input of "
+                f"{self.width}x{self.height}, to decode them at half size, found {width}x{height}"
+            )
 
 
 StillDof = Literal["tx", "ty", "tz", "rx", "ry", "rz"]
@@ -289,8 +300,11 @@ class ImageSpec(_Strict, frozen=True):
     colour: bool
 
 
+Version = Literal[1, 2, 3]
+
+
 class Calibration(_Strict, frozen=True, omit_defaults=True):
-    """The contents of ``calibration.json``: version 1, or 2 with ``quantiles``.
+    """The contents of ``calibration.json``; see ``version_of`` for its version.
 
     ``camera``: intrinsics of the calibration images' camera; null if the data set does not state
     them. ``images``: their size and colour; null in bundles of earlier releases. ``alarm``: when a
@@ -299,7 +313,7 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
     ``quantiles``: thresholds at many more confidences; null in bundles of earlier releases.
     """
 
-    schema_version: Literal[1, 2]
+    schema_version: Version
     name: Text
     method: Text
     model: ModelSpec
@@ -342,3 +356,8 @@ class Calibration(_Strict, frozen=True, omit_defaults=True):
             return msgspec.convert(self.method_parameters, kind, strict=True)
         except msgspec.ValidationError as error:
             raise CalibrationFileError(f"method_parameters: {one_line(str(error))}") from None
+
+
+def version_of(inputs: PreprocessSpec, quantiles: QuantileTable | None) -> Version:
+    """Return the version: 3 for images decoded at half size, 2 with quantiles, 1 for others."""
+    return 3 if inputs.decode == "half" else 1 if quantiles is None else 2

@@ -85,11 +85,6 @@ def reaches(calibration: Calibration) -> tuple[Reach, ...]:
 def check_quantiles(calibration: Calibration) -> None:
     """Raise CalibrationFileError if quantiles contradict each other or the stored thresholds."""
     table = calibration.quantiles
-    if (table is not None) != (calibration.schema_version == 2):
-        raise CalibrationFileError(
-            "schema_version: expected 2 for a bundle with quantiles and 1 for others, found "
-            f"{calibration.schema_version}"
-        )
     if table is None:
         return
     for low, high in pairwise(table.confidences):

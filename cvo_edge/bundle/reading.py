@@ -16,7 +16,7 @@ from cvo_edge.documents import decode_document, encode_document
 from cvo_edge.errors import BundleMismatchError, CalibrationFileError, ModelError
 from cvo_edge.files import read_regular_file, regular_file
 
-SCHEMA_VERSIONS = (1, 2)
+SCHEMA_VERSIONS = (1, 2, 3)
 MAX_CALIBRATION_BYTES = 64 * 1024
 MAX_MODEL_BYTES = 1 << 30
 

@@ -12,10 +12,11 @@ from cvo_edge.bundle.format import (
     SixOrUnbounded,
     TensorSpec,
     Threshold,
+    version_of,
 )
 from cvo_edge.bundle.quantiles import check_quantiles
 from cvo_edge.documents import shown
-from cvo_edge.errors import CalibrationFileError
+from cvo_edge.errors import CalibrationFileError, UsageError
 
 
 def check_rules(calibration: Calibration) -> None:
@@ -50,6 +51,7 @@ def check_rules(calibration: Calibration) -> None:
             "thresholds.left_out: expected null with a single calibration recording, found a "
             "coverage"
         )
+    _check_version(calibration)
     _check_thresholds(calibration.thresholds)
     check_quantiles(calibration)
     _check_crossed(calibration)
@@ -150,8 +152,25 @@ def _check_model(calibration: Calibration) -> None:
         )
 
 
+def _check_version(calibration: Calibration) -> None:
+    expected = version_of(calibration.preprocess, calibration.quantiles)
+    if calibration.schema_version != expected:
+        kind = {1: "without quantiles", 2: "with quantiles", 3: "that decodes at half size"}
+        raise CalibrationFileError(
+            f"schema_version: expected {expected} for a bundle {kind[expected]}, found "
+            f"{calibration.schema_version}"
+        )
+
+
 def _check_images(calibration: Calibration) -> None:
     images, camera = calibration.images, calibration.camera
+    if calibration.preprocess.decode == "half":
+        if images is None:
+            raise CalibrationFileError("images: expected a size with decode half, found null")
+        try:
+            calibration.preprocess.check_halves(images.height, images.width)
+        except UsageError as error:
+            raise CalibrationFileError(f"preprocess.{error}") from None
     if images is None or camera is None:
         return
     if (images.width, images.height) != (camera.width, camera.height):

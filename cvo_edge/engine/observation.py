@@ -25,6 +25,7 @@ from cvo_edge.errors import UsageError
 from cvo_edge.heads import Head
 from cvo_edge.input import preprocess
 from cvo_edge.input.frame_checks import Look, image_doubt
+from cvo_edge.input.half import check_decoder
 from cvo_edge.input.image_checks import ROUNDING_PX, KnownImages, StreamSizes
 from cvo_edge.input.view import View, check_same_view, crop_view, matched_view, seen_camera
 from cvo_edge.pose import Chart
@@ -119,7 +120,10 @@ class Observer:
     ModelError, BundleMismatchError
         The engine refuses the model, or the model does not match ``spec``.
     UsageError
-        The images of ``camera`` cannot be brought to the view that the network has learned.
+        The images of ``camera`` cannot be brought to the view that the network has learned, or not
+        be decoded at half size where ``inputs`` says so.
+    GateError
+        They are to be decoded at half size, and this machine's decoder has other rules.
     """
 
     def __init__(
@@ -140,6 +144,8 @@ class Observer:
         self.session: Session | None = open_session(
             model, threads, spec, spinning=spinning, at_once=at_once
         )
+        if inputs.decode == "half":
+            check_decoder()
         self._inputs = inputs
         self._head = head
         self._seen = None
@@ -270,9 +276,12 @@ class Observer:
             sized = self._cameras and self._cameras[0]
         if sized is None:
             return None
-        size = sized.height, sized.width
+        size, half = (sized.height, sized.width), self._inputs.decode == "half"
+        if half:
+            self._inputs.check_halves(*size)
+            size = size[0] // 2, size[1] // 2
         colour = images is not None and images.colour
-        return KnownImages(size, colour, max(1.0, self._view(*size).enlarged), rounding_px)
+        return KnownImages(size, colour, max(1.0, self._view(*size).enlarged), rounding_px, half)
 
     def _checked(
         self, outputs: Mapping[str, NDArray[Any]], fault: Reason | None

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from cvo_edge.errors import UsageError
 from cvo_edge.given import given_count
+from cvo_edge.vocabulary import Decode
 
 # 192 MiB as BGR, and several times that while some formats are decoded; 8K cameras have half of it.
 MAX_PIXELS = 1 << 26
@@ -25,7 +26,10 @@ MAX_PIXELS = 1 << 26
 MAX_IMAGE_BYTES = 1 << 29
 
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+# libjpeg-turbo's inverse transform of 4x4 values for each block of 8x8.
+_HALF_FLAGS = cv2.IMREAD_REDUCED_COLOR_2 | cv2.IMREAD_IGNORE_ORIENTATION
 
+JPEG_START = b"\xff\xd8"
 _JPEG_END, _JPEG_SCAN = b"\xff\xd9", b"\xff\xda"
 # Segments and chunks before the picture; cameras write about ten, of at most 64 KiB in a JPEG.
 _MOST_PARTS = 4096
@@ -59,7 +63,9 @@ def checked_bits(bits: object) -> int:
     return count
 
 
-def decode_image(content: bytes, bits: int = 16) -> NDArray[np.uint8] | None:
+def decode_image(
+    content: bytes, bits: int = 16, decode: Decode = "full"
+) -> NDArray[np.uint8] | None:
     """Decode an image file to (height, width, 3) uint8 BGR; None if it is damaged or unsupported.
 
     JPEG, PNG, BMP, PNM, TIFF and WebP are recognised by their first bytes. Grey is repeated, alpha
@@ -69,14 +75,22 @@ def decode_image(content: bytes, bits: int = 16) -> NDArray[np.uint8] | None:
     some OpenCV versions decode a cut JPEG to a wrong picture of full size, so its end marker is
     checked first. Altered bytes within a JPEG's data mostly pass because, unlike PNG, it has no
     checksum.
+
+    ``half`` decodes a JPEG to half its height and width, rounded upwards, in less time: the pixels
+    are close to the means of four, but not equal. Other formats cannot do that and give None.
     """
     size = image_size(content)
     if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
         return None
+    if decode == "half":
+        if not content.startswith(JPEG_START):
+            return None
+        size = (size[0] + 1) // 2, (size[1] + 1) // 2
     if content.startswith(_TIFF_STARTS):
         content = _unturned(content)
     try:
-        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), _FLAGS)
+        flags = _FLAGS if decode == "full" else _HALF_FLAGS
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     except (cv2.error, MemoryError):
         return None
     if image is None or image.shape[:2] != size:
@@ -244,7 +258,7 @@ def _webp(content: bytes) -> tuple[int, int] | None:
 
 
 _FORMATS: tuple[tuple[bytes, Callable[[bytes], tuple[int, int] | None]], ...] = (
-    (b"\xff\xd8", _jpeg),
+    (JPEG_START, _jpeg),
     (b"\x89PNG\r\n\x1a\n", _png),
     (b"BM", _bmp),
     (b"P", _pnm),

@@ -27,6 +27,7 @@ from cvo_edge.input.image_files import (
 from cvo_edge.input.stamps import stamp_in_name
 from cvo_edge.input.videos import itself
 from cvo_edge.input.waiting import Patience
+from cvo_edge.vocabulary import Decode
 
 _POLL_S = 0.05
 # After so long without a change, a file that cannot be read is given as such.
@@ -81,6 +82,7 @@ class FollowedFolder:
         bits: int = 16,
     ) -> None:
         self._bits = bits
+        self._decode: Decode = "full"
         self.live, self.left_out = live, Counter[str]()
         self._folder, self._fps, self._quiet_s, self._clock = folder, fps, quiet_s, clock
         self._stopped = Event()
@@ -93,6 +95,10 @@ class FollowedFolder:
     def stop(self) -> None:
         """End the frames, also while the next one is waited for."""
         self._stopped.set()
+
+    def halve(self) -> None:
+        """Decode at half size; images of other formats than JPEG are then unreadable."""
+        self._decode = "half"
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield the frames; each is read before its call is yielded."""
@@ -183,16 +189,19 @@ class FollowedFolder:
             now_s, before = self._clock.now_s(), state
             state = _state(path)
             if state is None:
-                return read_image_file(path, None, self._bits)  # it has vanished, or leads nowhere
+                return self._read(path)  # it has vanished, or leads nowhere
             age_s = max(1e-9 * (self._clock.time_ns() - state[1]), 0.0)
             if frame is None or state != before:
-                since_s, frame = now_s, read_image_file(path, None, self._bits)
+                since_s, frame = now_s, self._read(path)
             unchanged_s = max(now_s - since_s, age_s if before in (None, state) else 0.0)
             whole = frame.image is not None and (ends or unchanged_s >= _STEADY_S)
             if whole or unchanged_s >= _GIVEN_UP_S:
                 return self._arrived(frame, age_s) if self.live else frame
             self._wait()
         return None
+
+    def _read(self, path: str) -> Frame:
+        return read_image_file(path, None, self._bits, self._decode)
 
     def _arrived(self, frame: Frame, age_s: float) -> Frame:
         now_s = self._clock.now_s() - 1e-3 * frame.read_ms

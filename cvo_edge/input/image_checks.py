@@ -40,12 +40,15 @@ class KnownImages(NamedTuple):
         How often these images are enlarged in the model's input, at least 1.
     rounding_px
         Pixels by which a side may differ from that of the same shape.
+    half
+        Whether this is the size of files that were decoded at half of theirs, and no other will do.
     """
 
     size: tuple[int, int]
     colour: bool
     enlarged: float
     rounding_px: float
+    half: bool = False
 
     def doubt(self, look: Look, enlarged: float) -> Reason | None:
         """Return why an image is none of these, or None.
@@ -54,6 +57,8 @@ class KnownImages(NamedTuple):
         """
         if not similar(look.size, self.size, self.rounding_px):
             return Reason.CAMERA_DIFFERS
+        if self.half and look.size != self.size:
+            return Reason.IMAGE_NOT_HALF
         if enlarged > _ENLARGED * self.enlarged:
             return Reason.IMAGE_TOO_SMALL
         return Reason.IMAGE_GREY if self.colour and not has_colour(look) else None

@@ -17,9 +17,12 @@ from cvo_edge.files import natural_text, read_regular_file
 from cvo_edge.input.capture import shown
 from cvo_edge.input.decoding import MAX_IMAGE_BYTES, decode_image, is_image
 from cvo_edge.input.frame import Frame
+from cvo_edge.input.half import not_half
 from cvo_edge.input.stamps import read_stamps, stamps_in_names
+from cvo_edge.vocabulary import Decode
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
+_JPEG_SUFFIXES = (".jpg", ".jpeg")
 # Videos whose first bytes are those of an image.
 _JPEGS_IN_A_ROW = (".mjpg", ".mjpeg")
 
@@ -71,6 +74,7 @@ class ImageFiles:
         bits: int = 16,
     ) -> None:
         self._bits = bits
+        self._decode: Decode = "full"
         self._folder, self._names, self.left_out = listing
         if not self._names:
             reasons = f"; left out {left_out_text(self.left_out)}" if self.left_out else ""
@@ -91,10 +95,17 @@ class ImageFiles:
         """The files, in order."""
         return (os.path.join(self._folder, name) for name in self._names)  # noqa: PTH118
 
+    def halve(self) -> None:
+        """Decode at half size; raises UsageError for a file that is named as no JPEG."""
+        for name in self._names:
+            if not name.lower().endswith(_JPEG_SUFFIXES):
+                raise not_half(shown(Path(name).name))
+        self._decode = "half"
+
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield one call a file."""
         for path, stamp_ns in zip(self.paths, self._stamps_ns, strict=False):
-            yield partial(read_image_file, path, stamp_ns, self._bits)
+            yield partial(read_image_file, path, stamp_ns, self._bits, self._decode)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield one frame a file."""
@@ -102,12 +113,14 @@ class ImageFiles:
             yield read()
 
 
-def read_image_file(path: str, stamp_ns: int | None, bits: int = 16) -> Frame:
+def read_image_file(
+    path: str, stamp_ns: int | None, bits: int = 16, decode: Decode = "full"
+) -> Frame:
     """Read and decode one image file; a frame without an image if that fails."""
     start = perf_counter()
     try:
         content = read_regular_file(Path(path), MAX_IMAGE_BYTES, SourceError, links=True)
-        image = decode_image(content, bits)
+        image = decode_image(content, bits, decode)
     except SourceError:
         image = None
     spent = 1e3 * (perf_counter() - start)

@@ -13,7 +13,7 @@ MOST_BYTES = 1 << 27
 
 _START = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
 _LONGEST_START = 8
-_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 # In a JPEG's data, 0xFF is followed by 0, by a restart marker, or by the next marker.
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _BEGIN, _END, _SCAN = 0xD8, 0xD9, 0xDA
@@ -50,7 +50,7 @@ class ImageRow:
         """Yield the images that end in ``content``; no bytes for one that is damaged."""
         self._bytes += content
         while self._begun or self._begin():
-            end = self._png() if self._bytes.startswith(_PNG_START) else self._jpeg()
+            end = self._png() if self._bytes.startswith(PNG_START) else self._jpeg()
             if end is None:
                 return
             image = bytes(self._bytes[:end]) if end else b""
@@ -90,7 +90,7 @@ class ImageRow:
 
     def _png(self) -> int | None:
         """Return where the image ends: None if that is not known yet, 0 if it is damaged."""
-        self._at = max(self._at, len(_PNG_START))
+        self._at = max(self._at, len(PNG_START))
         while len(head := self._bytes[self._at : self._at + 8]) == 8:
             length, name = int.from_bytes(head[:4], "big"), head[4:]
             if length > MOST_BYTES or not name.isalpha():

@@ -22,12 +22,14 @@ from cvo_edge.input.clock import SYSTEM_CLOCK, Clock
 from cvo_edge.input.containers import check_start
 from cvo_edge.input.decoding import decode_image
 from cvo_edge.input.frame import Frame
+from cvo_edge.input.half import not_half
 from cvo_edge.input.image_files import stamp_at
-from cvo_edge.input.image_row import MOST_BYTES, ImageRow, starts_row
+from cvo_edge.input.image_row import MOST_BYTES, PNG_START, ImageRow, starts_row
 from cvo_edge.input.pieces import Pieces, index_at_end
 from cvo_edge.input.queue_lag import LagAccount
 from cvo_edge.input.stamps import ListedStamps
 from cvo_edge.input.videos import Video, VideoStamps
+from cvo_edge.vocabulary import Decode
 
 _STDIN = ("-", "/dev/stdin", "/dev/fd/0", "/proc/self/fd/0")
 _START_BYTES = 4096
@@ -174,12 +176,19 @@ class PipedImages:
         self.live = live
         self.length: int | None = None
         self._pipe, self._clock = pipe, clock
+        self._decode: Decode = "full"
         self._stamps = stamps or VideoStamps(fps, 0.0)
         self._stopped = Event()
 
     def stop(self) -> None:
         """End the frames, also while the next one is waited for."""
         self._stopped.set()
+
+    def halve(self) -> None:
+        """Decode at half size; raises UsageError if the first image is a PNG."""
+        if self._pipe.start.startswith(PNG_START):
+            raise not_half("PNG images")
+        self._decode = "half"
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames; raises SourceError if the last one is cut."""
@@ -195,7 +204,9 @@ class PipedImages:
                 for image in row.feed(content):
                     (stamp_ns,) = self._stamps.next(1, 0.0)
                     frame = Frame(None, stamp_ns, f"{self._pipe.name}#{seq}", 0.0)
-                    yield partial(_decoded, image, ages.arrived(frame) if self.live else frame)
+                    if self.live:
+                        frame = ages.arrived(frame)
+                    yield partial(_decoded, image, frame, self._decode)
                     seq += 1
                 if row.overlong:
                     raise SourceError(
@@ -226,9 +237,9 @@ class _Ages:
         return replace(frame, stamp_ns=stamp_ns, queued_ms=queued_ms, arrived_s=now)
 
 
-def _decoded(content: bytes, frame: Frame) -> Frame:
+def _decoded(content: bytes, frame: Frame, decode: Decode) -> Frame:
     begin = perf_counter()
-    image = decode_image(content)
+    image = decode_image(content, decode=decode)
     return replace(frame, image=image, read_ms=1e3 * (perf_counter() - begin))
 
 

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from cvo_edge.camera import Distortion
 from cvo_edge.input.decoding import MAX_PIXELS, decode_image, image_size, upper_eight
+from cvo_edge.input.half import not_half
+from cvo_edge.vocabulary import Decode
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -78,17 +80,20 @@ def message_size(message: Any) -> tuple[int, int] | None:
     return (height, width) if whole else None
 
 
-def message_image(message: Any, bits: int = 16) -> Image | None:
+def message_image(message: Any, bits: int = 16, decode: Decode = "full") -> Image | None:
     """Return the image in a message, (height, width, 3) BGR; None if it cannot be decoded.
 
-    16 bits keep the upper eight of ``bits``, as in ``decode_image``.
+    16 bits keep the upper eight of ``bits``, and ``half`` decodes at half size, as in
+    ``decode_image``. Raises UsageError for an uncompressed image that is to be halved.
     """
     size = message_size(message)
     if size is None:
         return None
     content = np.frombuffer(message.data, np.uint8)
     if not hasattr(message, "encoding"):
-        return decode_image(content.tobytes(), bits)
+        return decode_image(content.tobytes(), bits, decode)
+    if decode == "half":
+        raise not_half("an uncompressed image")
     form, (height, width) = FORMS[message.encoding], size
     rows = content[: message.step * height].reshape(height, message.step)
     pixels = np.ascontiguousarray(rows[:, : width * form.channels * form.depth])

@@ -23,6 +23,7 @@ from cvo_edge.estimate import PoseInterval
 from cvo_edge.input import preprocess
 from cvo_edge.input.capture import shown
 from cvo_edge.input.frame import Frame
+from cvo_edge.input.half import halve
 from cvo_edge.input.pipes import names_pipe
 from cvo_edge.input.sources import names_camera, open_source
 from cvo_edge.odometer import Odometer
@@ -103,6 +104,8 @@ def benchmark(
     ) as odometer:
         load_ms = 1e3 * (perf_counter() - start)
         stream = _Endless(source, _still_size(odometer.calibration), threads)
+        if odometer.calibration.preprocess.decode == "half":
+            stream.halve()
         report = _measured(odometer, source, stream, frames, warmup, load_ms)
         if stages:
             from cvo_edge.programs.stages import measure
@@ -264,9 +267,14 @@ class _Endless:
     ) -> None:
         self.still, self._size = source is None, size
         self._source, self._threads = source, threads
+        self._half = False
         self.live = source is not None and names_camera(source)
         # One iterator for all callers, because many cameras serve a single client only.
         self._numbered = enumerate(self._again())
+
+    def halve(self) -> None:
+        """Decode at half size."""
+        self._half = True
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield a call per frame; frames of files get the stamps of a camera at a constant rate."""
@@ -284,7 +292,10 @@ class _Endless:
             while True:
                 yield lambda: still
         while True:
-            reads = open_source(self._source, threads=self._threads).reads()
+            frames = open_source(self._source, threads=self._threads)
+            if self._half:
+                halve(frames)
+            reads = frames.reads()
             first = next(reads, None)
             if first is None:
                 raise SourceError(f"{shown(self._source)}: the source has no frames")
@@ -301,6 +312,8 @@ def _still_size(calibration: Calibration) -> tuple[int, int]:
     images = calibration.images
     if images is None:
         return _DEFAULT_HEIGHT, _DEFAULT_WIDTH
+    if calibration.preprocess.decode == "half":
+        return images.height // 2, images.width // 2
     width = max(_DEFAULT_WIDTH, calibration.preprocess.width)
     return round(width * images.height / images.width), width
 

@@ -27,6 +27,7 @@ from cvo_edge.heads.checked import checked_head
 from cvo_edge.heads.plausible import check_plausible, selftest_sets
 from cvo_edge.monitor.alarm import alarm_statement
 from cvo_edge.pose import Chart
+from cvo_edge.vocabulary import Decode
 
 # The confidence of the measured coverage that is shown.
 _SHOWN = 0.9
@@ -39,6 +40,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
     details = f", {head.description()}" if head.description() else ""
     tensors = ", ".join(f"{t.name} {list(t.shape)}" for t in (*model.inputs, *model.outputs))
     dof, scale = Chart(pose.rotation).dof, calibration.difficulty
+    images = calibration.images
     lines = [
         *_entry("name", calibration.name),
         *_entry("method", f"{calibration.method}, {source.score} score{details}"),
@@ -59,7 +61,11 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         ),
         *_crossed(source),
         *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
-        *([] if calibration.images is None else _entry("images", _images(calibration.images))),
+        *(
+            []
+            if images is None
+            else _entry("images", _images(images, calibration.preprocess.decode))
+        ),
         *_entry("alarm", alarm_statement(calibration)),
         *([] if scale is None else _entry("difficulty", _difficulty(scale))),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
@@ -116,8 +122,10 @@ def _position(position_m: Position) -> str:
     return " ".join(f"{value:.10g}" for value in position_m) + " m in the world"
 
 
-def _images(images: ImageSpec) -> str:
-    return f"{images.width}x{images.height}, " + ("colour" if images.colour else "grey or mixed")
+def _images(images: ImageSpec, decode: Decode) -> str:
+    colour = "colour" if images.colour else "grey or mixed"
+    half = "; JPEG files, decoded at half size" if decode == "half" else ""
+    return f"{images.width}x{images.height}, {colour}{half}"
 
 
 def _camera(camera: Camera) -> str:

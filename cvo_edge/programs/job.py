@@ -13,6 +13,7 @@ from cvo_edge.errors import UsageError
 from cvo_edge.estimate import PoseInterval
 from cvo_edge.ground_truth import GroundTruth
 from cvo_edge.input.frame import Source
+from cvo_edge.input.half import halve
 from cvo_edge.input.sources import open_source
 from cvo_edge.input.waiting import Patience
 from cvo_edge.odometer import Odometer
@@ -127,6 +128,8 @@ def opened(
         ) as odometer,
         ExitStack() as stack,
     ):
+        if odometer.calibration.preprocess.decode == "half":
+            halve(frames)
         if wanted.region and not odometer.has_region:
             raise UsageError(
                 f"--region: expected a bundle of mcqr, scr or fused and the joint scope, found "

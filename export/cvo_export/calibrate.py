@@ -36,7 +36,7 @@ from cvo_edge.given import given_path
 from cvo_edge.heads import HEADS, Candidate
 from cvo_edge.heads.cqr import CqrParameters
 from cvo_edge.pose import about
-from cvo_edge.vocabulary import Crop, Joint, Provider, Rule, Sides, SplitKind
+from cvo_edge.vocabulary import Crop, Decode, Joint, Provider, Rule, Sides, SplitKind
 from cvo_export.bundles.candidates import selected
 from cvo_export.bundles.draft import (
     CAMERA_FRAME,
@@ -94,6 +94,7 @@ def calibrate(
     size_text: str | None = None,
     new_data: bool = False,
     provider: Provider | None = None,
+    decode: Decode | None = None,
 ) -> Calibration:
     """Calibrate a model file or the model of a bundle on a data set and write the new bundle.
 
@@ -109,7 +110,8 @@ def calibrate(
     and ``--size``, which adapt a model file of another form (see ``graph.adapt``).
     ``new_data`` states that a data set with the name of the training data contains none of its
     frames. ``provider`` (None: the bundle's provider, or ``onnxruntime`` for a model file) is the
-    inference engine that the new bundle is made for.
+    inference engine that the new bundle is made for, and ``decode`` (None: the bundle's, or
+    ``full``) how it decodes JPEG files.
 
     Raises
     ------
@@ -170,6 +172,10 @@ def calibrate(
         val = split.roles["val"]
         _say(tried(network, form, dataset, val, origin_m, stated=bool(given_outputs)))
     rule, cap = chosen_rule(rule, cap, split.kind)
+    inputs = msgspec.structs.replace(draft.preprocess, decode=decode or draft.preprocess.decode)
+    if inputs.decode == "half":
+        inputs.check_halves(size[1], size[0])
+    dataset = dataset.decoded(inputs.decode)
     own = provider or draft.model.provider
     # A solver's network recognises the place as the camera of its training shows it.
     solves = HEADS[draft.method].solves
@@ -185,6 +191,7 @@ def calibrate(
         camera=draft.camera if solves else dataset.camera() or _of_size(draft.camera, size),
         running=dataset.camera() if solves else None,
         model=msgspec.structs.replace(draft.model, provider=own),
+        preprocess=inputs,
         provenance=msgspec.structs.replace(draft.provenance, created_with=made),
     )
     chosen_from = selected(candidates, score, sides)

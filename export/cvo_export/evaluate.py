@@ -86,6 +86,7 @@ def evaluate(
         )
     bundle = read_bundle(bundle_dir)
     calibration = bundle.calibration
+    dataset = dataset.decoded(calibration.preprocess.decode)
     recorded = calibration.calibration.split
     first = calibration.thresholds[0]
     split = same_split(dataset, recorded) if subset == "test" else None

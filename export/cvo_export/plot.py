@@ -131,6 +131,7 @@ def track(
     """
     bundle = read_bundle(bundle_dir)
     bundle = replace(bundle, calibration=msgspec.structs.replace(bundle.calibration, alarm=None))
+    dataset = dataset.decoded(bundle.calibration.preprocess.decode)
     camera = dataset.camera() if bundle.head.solves else None
     with Odometer(bundle, confidence=confidence, scope=scope, camera=camera) as odometer:
         indices = subset_indices(odometer.calibration, dataset, subset)

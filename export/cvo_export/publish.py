@@ -19,7 +19,7 @@ from cvo_edge.errors import GateError
 from cvo_edge.given import given_path
 from cvo_edge.input import preprocess
 from cvo_edge.input.frame_checks import SAMPLE_STEP
-from cvo_edge.vocabulary import Joint, Precision, Provider, Rule, Sides
+from cvo_edge.vocabulary import Decode, Joint, Precision, Provider, Rule, Sides
 from cvo_export.bundles.candidates import selected
 from cvo_export.bundles.crossed import Fold, calibrated_crossed
 from cvo_export.bundles.draft import (
@@ -69,13 +69,15 @@ def publish(
     sides: Sides | None = None,
     precision: Precision = "fp32",
     provider: Provider = "onnxruntime",
+    decode: Decode = "full",
 ) -> Calibration:
     """Export and calibrate a finished run, write its bundle and return the calibration.
 
     ``rule`` and ``cap`` None mean the default of the run's split (see ``chosen_rule``); ``score``
     None chooses the score on the val frames. ``int8`` quantises the backbone before calibration.
     Scores and thresholds always come from the exported graph, run by ``provider``; in a crossed
-    run, from the graphs of its folds, which are exported in the same way.
+    run, from the graphs of its folds, which are exported in the same way. ``half`` decodes the JPEG
+    files of the data set, and those that the bundle will run on, at half size.
 
     Raises
     ------
@@ -84,7 +86,8 @@ def publish(
     SinkError
         The folder cannot be written, or contains files that do not belong to a bundle.
     UsageError
-        The method does not have the requested score or sides, or the rule the cap.
+        The method does not have the requested score or sides, or the rule the cap; ``half`` with
+        images that are no JPEG files, have odd sides or fewer pixels than twice the model's input.
     SourceError
         The images of the data set have several sizes.
     ModelError
@@ -92,12 +95,15 @@ def publish(
     """
     bundle_dir = given_path(bundle_dir, "bundle")
     check_target(bundle_dir)
-    one_size(run.dataset)
-    run = replace(run, dataset=remembered(run.dataset))
+    size = one_size(run.dataset)
+    inputs = _preprocess(run, decode)
+    if decode == "half":
+        inputs.check_halves(size[1], size[0])
+    run = replace(run, dataset=remembered(run.dataset.decoded(decode)))
     candidates = selected(run.graph.head.candidates(), score, sides)
     rule, cap = chosen_rule(rule, cap, run.split.kind)
     model_bytes, parity = _export(run, run.graph.head, run.training_frames, precision, provider)
-    draft = _draft(run, model_bytes, name, (rule, cap), joint, parity, provider)
+    draft = _draft(run, model_bytes, inputs, name, (rule, cap), joint, parity, provider)
     if run.folds:
         folds = [
             _fold(run, head, indices, draft, precision, score, sides)
@@ -229,6 +235,7 @@ def _compare(
 def _draft(
     run: Run,
     model_bytes: bytes,
+    inputs: PreprocessSpec,
     name: str,
     rule: tuple[Rule, float | None],
     joint: Joint,
@@ -247,17 +254,7 @@ def _draft(
         name=name,
         method=run.graph.head.runtime_method,
         model=model,
-        preprocess=PreprocessSpec(
-            height=config.height,
-            width=config.width,
-            colour_order="rgb",
-            interpolation="halve_then_linear_exact",
-            crop=config.crop,
-            mean=_three(run.graph.backbone.mean),
-            std=_three(run.graph.backbone.std),
-            layout="nhwc",
-            in_graph=("cast", "transpose", "normalise"),
-        ),
+        preprocess=inputs,
         pose=PoseSpec(
             target="absolute",
             frame_id=WORLD_FRAME,
@@ -292,6 +289,21 @@ def _draft(
         split=run.split.spec(run.dataset),
         dataset=run.dataset.name,
         crossed=run.config.crossed or None,
+    )
+
+
+def _preprocess(run: Run, decode: Decode) -> PreprocessSpec:
+    return PreprocessSpec(
+        height=run.config.height,
+        width=run.config.width,
+        colour_order="rgb",
+        interpolation="halve_then_linear_exact",
+        crop=run.config.crop,
+        mean=_three(run.graph.backbone.mean),
+        std=_three(run.graph.backbone.std),
+        layout="nhwc",
+        in_graph=("cast", "transpose", "normalise"),
+        decode=decode,
     )
 
 

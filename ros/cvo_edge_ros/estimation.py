@@ -18,7 +18,7 @@ from cvo_edge.odometer import Odometer
 from cvo_edge.output.messages import TRANSFORM, Message, Placement, ros_messages
 from cvo_edge.output.records import header_of
 from cvo_edge.programs.placing import Placing
-from cvo_edge.vocabulary import Scope
+from cvo_edge.vocabulary import Decode, Scope
 
 # Parameters of the node and their defaults; an empty text and a zero stand for none.
 PARAMETERS: dict[str, str | float | bool] = {
@@ -111,16 +111,22 @@ def camera_of(info: Any, image_topic: str) -> Camera:
         raise UsageError(f"camera_info: {error}") from None
 
 
-def frame_of(message: Any, dropped: int, now_ns: int, clock: Clock = SYSTEM_CLOCK) -> Frame:
+def frame_of(
+    message: Any,
+    dropped: int,
+    now_ns: int,
+    clock: Clock = SYSTEM_CLOCK,
+    decode: Decode = "full",
+) -> Frame:
     """Return the frame of a message with an image.
 
     ``now_ns``: the node's clock. A frame is as old as its stamp says; one without a stamp is
-    stamped now.
+    stamped now. Raises UsageError for an uncompressed image that is to be decoded at half size.
     """
     arrived_s, start = clock.now_s(), perf_counter()
     stamp = message.header.stamp
     stamp_ns = 1_000_000_000 * int(stamp.sec) + int(stamp.nanosec) or now_ns
-    image = message_image(message)
+    image = message_image(message, decode=decode)
     return Frame(
         image,
         stamp_ns,
@@ -168,7 +174,10 @@ def answers(
             settings.unknown_variance or None,
         )
         placement = placing.placement(header) or Placement.of(header)
-        frames = (frame_of(message, dropped, now_ns()) for message, dropped in arrivals)
+        decode = calibration.preprocess.decode
+        frames = (
+            frame_of(message, dropped, now_ns(), decode=decode) for message, dropped in arrivals
+        )
         moving = True if settings.expect_motion else None
         before = None
         for estimate in odometer.stream(frames, moving=moving):

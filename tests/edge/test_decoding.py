@@ -15,8 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cvo_edge.errors import UsageError
+from cvo_edge.errors import GateError, UsageError
+from cvo_edge.input import half
 from cvo_edge.input.decoding import MAX_PIXELS, decode_image, image_size
+from cvo_edge.input.half import check_decoder
 from cvo_edge.input.sources import open_source
 
 SUFFIXES = (".jpg", ".png", ".bmp", ".ppm", ".pgm", ".tif", ".webp")
@@ -252,6 +254,56 @@ def test_no_header_is_an_error(start, rest):
     image_size(start + rest)
 
 
+JPEG_FORMS = [
+    (factor, progressive) for factor in (411, 420, 422, 440, 444) for progressive in (0, 1)
+]
+
+
+def jpeg_of(image, factor, progressive, quality=90):
+    options = {
+        cv2.IMWRITE_JPEG_QUALITY: quality,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR: getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{factor}"),
+        cv2.IMWRITE_JPEG_PROGRESSIVE: progressive,
+    }
+    done, content = cv2.imencode(".jpg", image, [x for pair in options.items() for x in pair])
+    assert done
+    return content.tobytes()
+
+
+@pytest.mark.parametrize("form", JPEG_FORMS)
+@pytest.mark.parametrize("shape", [(48, 64), (51, 67)])
+def test_half_a_jpeg_is_close_to_the_means_of_four_pixels(form, shape):
+    """Of a smooth picture: a grey level; the size is rounded upwards."""
+    smooth = cv2.GaussianBlur(picture(*shape), (0, 0), 3)
+    content = jpeg_of(smooth, *form)
+    found = decode_image(content, decode="half")
+    assert found.shape == ((shape[0] + 1) // 2, (shape[1] + 1) // 2, 3)
+    rows, columns = shape[0] // 2, shape[1] // 2
+    whole = decode_image(content)[: 2 * rows, : 2 * columns].astype(float)
+    means = whole.reshape(rows, 2, columns, 2, 3).mean(axis=(1, 3))
+    assert np.abs(found[:rows, :columns] - means).mean() < 1.0
+
+
+def test_half_a_picture_ignores_the_orientation_and_refuses_what_is_cut_or_no_jpeg():
+    content = encoded(".jpg", picture())
+    upright = decode_image(content, decode="half")
+    turned = decode_image(with_orientation(content, 6), decode="half")
+    np.testing.assert_array_equal(upright, turned)
+    assert decode_image(content[:-2], decode="half") is None
+    for suffix in set(SUFFIXES) - {".jpg", ".jpeg"}:
+        assert decode_image(encoded(suffix, picture()), decode="half") is None
+
+
+def test_another_rule_of_halving_is_found_out(monkeypatch):
+    """E.g. the means of four pixels, or the chroma of another library."""
+    check_decoder()
+    whole = decode_image(half._KNOWN)
+    for other in (None, cv2.resize(whole, (21, 14), interpolation=cv2.INTER_AREA)):
+        monkeypatch.setattr(half, "decode_image", lambda *_, other=other, **__: other)
+        with pytest.raises(GateError, match="libjpeg-turbo"):
+            check_decoder()
+
+
 OTHER = Path(__file__).resolve().parents[2] / ".opencv4"
 # An emulated board finds the host's copy there.
 TAGS = "".join(path.read_text("utf-8") for path in OTHER.glob("*.dist-info/WHEEL")).lower()
@@ -273,6 +325,7 @@ def test_another_release_of_opencv_reads_the_same(tmp_path, clip_dir):
             changed = bytearray(whole)
             changed[generator.integers(len(changed))] ^= 1 << int(generator.integers(8))
             contents.append(bytes(changed))
+    contents += [jpeg_of(picture(51, 67), *form) for form in JPEG_FORMS]
     contents += [encoded(suffix, wide) for suffix in (".png", ".tif", ".ppm")]
     contents += [with_orientation(contents[0], 6), contents[0] + bytes(100)]
     contents += [turned_tiff(encoded(".tif", picture()), number) for number in (3, 6)]
@@ -283,7 +336,8 @@ def test_another_release_of_opencv_reads_the_same(tmp_path, clip_dir):
     code = (
         "import cv2, hashlib, sys; from pathlib import Path; "
         "from cvo_edge.input.decoding import decode_image; print(cv2.__version__); "
-        "images = [decode_image(p.read_bytes()) for p in sorted(Path(sys.argv[1]).iterdir())]; "
+        "files = [p.read_bytes() for p in sorted(Path(sys.argv[1]).iterdir())]; "
+        "images = [decode_image(f, decode=d) for d in ('full', 'half') for f in files]; "
         "print(*(i if i is None else hashlib.sha256(i).hexdigest() for i in images), sep='\\n')"
     )
     path = os.pathsep.join([str(OTHER), *sys.path])
@@ -296,7 +350,7 @@ def test_another_release_of_opencv_reads_the_same(tmp_path, clip_dir):
     )
     version, *theirs = done.stdout.split()
     assert version.split(".")[0] != cv2.__version__.split(".")[0]
-    ours = [decode_image(content) for content in contents]
+    ours = [decode_image(each, decode=decode) for decode in ("full", "half") for each in contents]
     expected = ["None" if i is None else hashlib.sha256(i).hexdigest() for i in ours]
     assert [(n, a) for n, a in enumerate(theirs)] == [(n, b) for n, b in enumerate(expected)]
 

@@ -75,7 +75,7 @@ def calibrated_crossed(
     with draft.observer(model_bytes, first_head(draft, candidates)) as observer:
         val = observe(observer, dataset, val_indices)
     seen = [fold.observed(dataset) for fold in folds]
-    images = images_of(draft.camera, val.size, [each.coloured for each in (val, *seen)])
+    images = images_of(draft, val.size, [each.coloured for each in (val, *seen)])
     draft = replace(draft, images=images)
     if images.colour:
         val, *seen = (each.in_colour() for each in (val, *seen))

@@ -51,8 +51,8 @@ def degraded(
 
     def read_image(number: int) -> NDArray[np.uint8]:
         generator = np.random.default_rng((split.seed, number))
-        image = dataset.read_image(int(copied[number]))
-        return drawn(str(names[number]), generator).degrade(image, generator)
+        noise = drawn(str(names[number]), generator)
+        return dataset.read_changed(int(copied[number]), noise.degrade, generator)
 
     copies = replace(
         dataset,

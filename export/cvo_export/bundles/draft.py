@@ -33,6 +33,7 @@ from cvo_edge.bundle.format import (
     SixPositive,
     SplitSpec,
     Threshold,
+    version_of,
 )
 from cvo_edge.camera import Camera
 from cvo_edge.documents import UNWRITTEN
@@ -165,7 +166,7 @@ class Draft:
         """
         height, width = SELFTEST_SIZE
         return Calibration(
-            schema_version=1,
+            schema_version=version_of(self.preprocess, None),
             name=self.name,
             method=self.method,
             model=self.model,
@@ -210,14 +211,17 @@ class Counts(NamedTuple):
 
 
 def images_of(
-    camera: Camera | None, size: tuple[int, int], coloured: Sequence[NDArray[np.bool_]]
+    draft: Draft, size: tuple[int, int], coloured: Sequence[NDArray[np.bool_]]
 ) -> ImageSpec:
-    """Describe calibration images of a width and height; ``coloured`` (n,) tells role by role.
+    """Describe calibration images that were read in a width and height.
 
-    The size is that of the bundle's camera, if it states one: a solver that was calibrated with
-    another one is used with its own.
+    ``coloured`` (n,) tells role by role which have colour. The size is that of the bundle's camera,
+    if it states one: a solver that was calibrated with another one is used with its own.
     """
-    width, height = size if camera is None else (camera.width, camera.height)
+    camera, times = draft.camera, 2 if draft.preprocess.decode == "half" else 1
+    width, height = (times * side for side in size)
+    if camera is not None:
+        width, height = camera.width, camera.height
     # Without an image with colour, a role would have no frame left.
     colour = np.concatenate(coloured).mean() >= _COLOURED and all(each.any() for each in coloured)
     return ImageSpec(width=width, height=height, colour=bool(colour))

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from cvo_edge.bundle.format import Calibration, Column, QuantileTable, Threshold
+from cvo_edge.bundle.format import Calibration, Column, QuantileTable, Threshold, version_of
 from cvo_edge.bundle.reading import encode_calibration
 from cvo_edge.errors import CalibrationFileError
 from cvo_edge.heads import Head
@@ -46,7 +46,8 @@ def with_quantiles(calibration: Calibration, head: Head, bounds: Bounds) -> Cali
         if not kept:
             break
         table = _table(calibration, head, confidences, exact, kept, symmetric=symmetric)
-        found = replace(calibration, schema_version=2, quantiles=table)
+        version = version_of(calibration.preprocess, table)
+        found = replace(calibration, schema_version=version, quantiles=table)
         try:
             encode_calibration(found)
         except CalibrationFileError:

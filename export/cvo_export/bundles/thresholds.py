@@ -21,6 +21,7 @@ from cvo_edge.bundle.format import (
     AlarmSpec,
     Calibration,
     Threshold,
+    version_of,
 )
 from cvo_edge.conformal import (
     JointScale,
@@ -74,7 +75,7 @@ def calibrated(
     with draft.observer(model_bytes, first) as observer:
         val = observe(observer, dataset, roles["val"])
         cal = observe(observer, dataset, roles["cal"])
-    images = images_of(draft.camera, val.size, (val.coloured, cal.coloured))
+    images = images_of(draft, val.size, (val.coloured, cal.coloured))
     draft = dataclasses.replace(draft, images=images)
     if images.colour:
         val, cal = val.in_colour(), cal.in_colour()
@@ -150,7 +151,7 @@ def with_thresholds(
     found = counts(scored)
     return replace(
         calibration,
-        schema_version=1,
+        schema_version=version_of(calibration.preprocess, None),
         quantiles=None,
         thresholds=Quantiles(head, scored, val.scored(head), *rule).entries(),
         calibration=replace(

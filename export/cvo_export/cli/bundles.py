@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cvo_edge.programs.options import examples
-from cvo_edge.vocabulary import Crop, Precision, Provider, SplitKind
+from cvo_edge.vocabulary import Crop, Decode, Precision, Provider, SplitKind
 from cvo_export.cli.app import (
     CapOption,
     DatasetArgument,
@@ -38,6 +38,10 @@ def publish(
     provider: Annotated[
         Provider, typer.Option(help="Engine that the bundle is calibrated for and runs on.")
     ] = "onnxruntime",
+    decode: Annotated[
+        Decode,
+        typer.Option(help="half: JPEG files are read at half size, faster; nothing else can be."),
+    ] = "full",
     rule: RuleOption = None,
     cap: CapOption = None,
     joint: JointOption = "max",
@@ -64,6 +68,7 @@ def publish(
         sides=sides,
         precision=precision,
         provider=provider,
+        decode=decode,
     )
     print(*inspect_lines(calibration), sep="\n")
 
@@ -137,6 +142,10 @@ def calibrate(
         Provider | None,
         typer.Option(help="Engine to calibrate for; default: the bundle's own, or onnxruntime."),
     ] = None,
+    decode: Annotated[
+        Decode | None,
+        typer.Option(help="How JPEG files are read, see publish; default: the bundle's, or full."),
+    ] = None,
     name: NameOption = None,
 ) -> None:
     """Calibrate an existing network, an ONNX file or a bundle's, on data it has not seen.
@@ -168,6 +177,7 @@ def calibrate(
         size_text=size,
         new_data=new_data,
         provider=provider,
+        decode=decode,
     )
     print(*inspect_lines(calibration), sep="\n")
 

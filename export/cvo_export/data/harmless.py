@@ -62,6 +62,7 @@ def harmlessly_changed(dataset: PoseDataset, seed: int, unit: NDArray[np.int64])
     def read_image(index: int) -> Image:
         change = HARMLESS[int(unit[index]) % len(HARMLESS)]
         drawn_once = index if change is _grainy else int(unit[index])
-        return change(dataset.read_image(index), np.random.default_rng((seed, drawn_once)))
+        generator = np.random.default_rng((seed, drawn_once))
+        return dataset.read_changed(index, change, generator)
 
     return replace(dataset, read_image=read_image)

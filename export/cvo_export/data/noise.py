@@ -94,7 +94,8 @@ def noisy(dataset: PoseDataset, noise: Noise, seed: int) -> PoseDataset:
     """
 
     def read_image(index: int) -> Image:
-        return noise.degrade(dataset.read_image(index), np.random.default_rng((seed, index)))
+        generator = np.random.default_rng((seed, index))
+        return dataset.read_changed(index, noise.degrade, generator)
 
     return replace(dataset, read_image=read_image)
 

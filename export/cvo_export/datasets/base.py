@@ -10,9 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvo_edge.camera import Camera, Distortion
-from cvo_edge.errors import SourceError
+from cvo_edge.errors import SourceError, UsageError
+from cvo_edge.input.preprocess import halved
 from cvo_edge.pose import about
 from cvo_edge.trajectories.trajectory import Skipped
+from cvo_edge.vocabulary import Decode
+
+Image = NDArray[np.uint8]
 
 # A place whose middle is further than this from zero gets an origin of its own, of round numbers.
 _FAR_M, _ROUND_M = 1000.0, 100
@@ -76,6 +80,11 @@ class PoseDataset:
     read_image
         Maps a frame number to an image, shape (height, width, 3), uint8, BGR. Raises
         ``SourceError`` if the image cannot be read.
+    read_half
+        As ``read_image``, decoded at half size; raises ``SourceError`` for anything but a JPEG.
+        None if the data set has no image files.
+    read_whole
+        The former ``read_image`` of a data set that is read at half size, else None.
     image_size
         Maps a frame number to height and width of its image, from its header alone, or to None if
         it has none; None if the data set cannot tell sizes.
@@ -101,6 +110,8 @@ class PoseDataset:
     sequence_names: tuple[str, ...]
     frame_names: tuple[str, ...]
     read_image: Callable[[int], NDArray[np.uint8]]
+    read_half: Callable[[int], NDArray[np.uint8]] | None = None
+    read_whole: Callable[[int], NDArray[np.uint8]] | None = None
     image_size: Callable[[int], tuple[int, int] | None] | None = None
     intrinsics: Intrinsics | None = None
     lens: Lens = NO_DISTORTION
@@ -139,7 +150,7 @@ class PoseDataset:
         """
         if self.intrinsics is None:
             return None
-        height, width = self.read_image(0).shape[:2]
+        height, width = (self.read_whole or self.read_image)(0).shape[:2]
         return Camera(
             width=width,
             height=height,
@@ -147,6 +158,46 @@ class PoseDataset:
             distortion=self.lens.distortion,
             coefficients=self.lens.coefficients,
         )
+
+    def decoded(self, decode: Decode) -> PoseDataset:
+        """Return the data set with its images read as a bundle of this ``decode`` reads them.
+
+        Raises UsageError if its images are no JPEG files, by the first one.
+        """
+        if decode == "full":
+            return self
+        if self.read_half is None:
+            found = "images without files"
+        else:
+            try:
+                self.read_half(0)
+            except SourceError as error:
+                found = str(error)
+            else:
+                return replace(self, read_image=self.read_half, read_whole=self.read_image)
+        raise UsageError(
+            f"decode: expected JPEG files to decode at half size in {self.name}, found {found}"
+        )
+
+    def read_changed(
+        self,
+        index: int,
+        change: Callable[[Image, np.random.Generator], Image],
+        generator: np.random.Generator,
+    ) -> Image:
+        """Return an image with a change that keeps its size, e.g. noise, as a camera would add it.
+
+        A change that is made before the image is compressed cannot be decoded at half size. The
+        half picture is therefore changed as the means of four pixels of the whole one change.
+        """
+        image = self.read_image(index)
+        if self.read_whole is None:
+            return change(image, generator)
+        whole = self.read_whole(index)
+        half = image.shape[:2]
+        both = whole, change(whole, generator)
+        before, after = (halved(each, *half).astype(np.int16) for each in both)
+        return np.clip(image + (after - before), 0, 255).astype(np.uint8)
 
 
 # Bytes of images that ``remembered`` keeps.

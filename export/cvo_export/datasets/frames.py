@@ -17,6 +17,7 @@ from cvo_edge.input.decoding import decode_image, image_size
 from cvo_edge.input.image_files import frame_name, images_in
 from cvo_edge.trajectories.poses import pose_matrix_fault, read_pose_matrix
 from cvo_edge.trajectories.trajectory import LISTED_TWICE, Skipped, Trajectory
+from cvo_edge.vocabulary import Decode
 from cvo_export.datasets.base import PoseDataset
 
 Array = NDArray[np.float64]
@@ -124,6 +125,7 @@ class FrameList:
             sequence_names=tuple(self._sequence_names),
             frame_names=tuple(self._frame_names),
             read_image=image_reader(self._images),
+            read_half=image_reader(self._images, "half"),
             image_size=partial(_size_of, tuple(self._images)),
             skipped=self._skipped,
             left_out=dict(self._left_out),
@@ -135,20 +137,23 @@ class FrameList:
 BITS: ContextVar[int] = ContextVar("bits", default=16)
 
 
-def image_reader(paths: Sequence[Path]) -> Callable[[int], NDArray[np.uint8]]:
+def image_reader(
+    paths: Sequence[Path], decode: Decode = "full"
+) -> Callable[[int], NDArray[np.uint8]]:
     """Return a ``read_image`` for image files; colour and grey images are read as BGR."""
     bits = BITS.get()
 
     def read_image(index: int) -> NDArray[np.uint8]:
         path = paths[index]
         try:
-            image = decode_image(path.read_bytes(), bits)
+            image = decode_image(path.read_bytes(), bits, decode)
         except OSError as error:
             raise SourceError(
                 f"{path}: expected an image; the file cannot be read: {error.strerror}"
             ) from None
         if image is None:
-            raise SourceError(f"{path}: expected an image, found a damaged or incomplete file")
+            kind = "an image" if decode == "full" else "a JPEG image"
+            raise SourceError(f"{path}: expected {kind}, found a damaged or incomplete file")
         return image
 
     return read_image

@@ -28,6 +28,7 @@ from cvo_edge.trajectories.path_options import path_options
 from cvo_edge.trajectories.poses import matrix_to_pose
 from cvo_edge.trajectories.trajectory import Skipped
 from cvo_edge.trajectories.tum import MAX_STAMP_DIFFERENCE_NS
+from cvo_edge.vocabulary import Decode
 from cvo_export.datasets.bag_cameras import bag_camera
 from cvo_export.datasets.base import PoseDataset, skipped_text
 from cvo_export.datasets.folders import only_camera
@@ -107,6 +108,7 @@ def open_rosbag(path: str) -> PoseDataset:
         sequence_names=sequence_names,
         frame_names=tuple(names),
         read_image=lambda index: _read(images[index]),
+        read_half=lambda index: _read(images[index], "half"),
         image_size=lambda index: images[index].size,
         skipped=skipped,
         stamps_ns=np.array(stamps),
@@ -132,9 +134,9 @@ def _index(bag: Bag, topic: str, skipped: Skipped) -> tuple[list[_Image], Stamps
     return [image for _, image in rows], np.array([stamp for stamp, _ in rows]), frame
 
 
-def _read(image: _Image) -> NDArray[np.uint8]:
+def _read(image: _Image, decode: Decode = "full") -> NDArray[np.uint8]:
     message = image.bag.message(image.topic, image.received_ns, image.number)
-    found = message_image(message, image.bits)
+    found = message_image(message, image.bits, decode)
     if found is None:
         raise SourceError(
             f"{image.bag.path}: expected an image in {image.topic} at {image.received_ns} ns, "

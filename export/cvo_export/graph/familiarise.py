@@ -55,10 +55,10 @@ def familiarised(
         kept, cells, pixels = [], [], []
         for index, change in zip(indices.tolist(), cycle(changes), strict=False):
             try:
-                image = dataset.read_image(index)
+                image = dataset.read_changed(index, change, generator)
             except SourceError:
                 continue
-            outputs = session.run(feed(change(image, generator)))
+            outputs = session.run(feed(image))
             kept.append(index)
             cells.append(outputs[CELLS])
             pixels.append(outputs[PIXELS])
