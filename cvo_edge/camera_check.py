@@ -1,7 +1,7 @@
 """Whether the running camera is the one that was stated, from the frames of a stream.
 
 A frame whose pose was solved from scene coordinates also says a little about the camera
-(``PoseSolver.lens_evidence``): a gradient g and a curvature H of the likelihood in the logarithms
+(``pose_solver.LensEvidence``): a gradient g and a curvature H of the likelihood in the logarithms
 of both focal lengths and a radial distortion, which add up over frames. The lens that frames show
 is (sum H)^-1 sum g, with covariance (sum H)^-1. Two frames suffice where the lens is off by many
 deviations; over a window, a few percent of focal length show in hard frames, too. Frames from
@@ -11,7 +11,6 @@ nearly the same pose err in the same way: only frames that have moved add eviden
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -49,7 +48,7 @@ _NARROW = 2.0
 # Share of the usual motion between two frames of a recording that makes a frame new evidence.
 _STEP_SHARE, _LEAST_STEP = 0.5, 1e-6
 # The least distinct directions keep an estimate of what the frames leave open near zero.
-_PRIOR = 1e-6
+_OPEN = 1e-6 * np.eye(3)
 
 
 class LensLimits(Struct, frozen=True, forbid_unknown_fields=True):
@@ -106,13 +105,14 @@ class CameraCheck:
     ) -> None:
         self._solver, self._focal_px, self._error_px = solver, focal_px, error_px
         factor = _NARROW if narrow else 1.0
-        self._limits = factor * np.array([limits.log_focal, limits.log_focal, limits.distortion])
+        largest = np.array([limits.log_focal, limits.log_focal, limits.distortion])
         self._deviations = factor * np.array(limits.deviations)
-        self._step = np.array(limits.step)
+        self._step = limits.step
         self._last: Array | None = None
-        self._clear: deque[Evidence] = deque(maxlen=WINDOW)
-        self._familiar: deque[Evidence] = deque(maxlen=WINDOW)
-        self._kept: list[tuple[Array, Array, Array]] = []
+        self._clear, self._familiar = _Window(1.0), _Window(_WEAK)
+        # For the pair and the whole of each window.
+        self._limits = factor * np.array([[[1.0]] * 2, [[_WEAK]] * 2]) * largest
+        self._kept: list[tuple[NDArray[Any], NDArray[Any], Array]] = []
         self._seen, self._stride = 0, 1
         # The verdict of whole windows, and for how many frames that of two still holds.
         self._differs, self._held = False, 0
@@ -127,59 +127,88 @@ class CameraCheck:
         if self._seen % self._stride == 0:
             self._keep(outputs)
         self._seen += 1
-        evidence = outputs["lens_gradient"][0], outputs["lens_information"][0]
         pose = outputs["solved_pose"][0]
-        if familiar and (self._last is None or (_motion(self._last, pose) > self._step).any()):
+        if familiar and (self._last is None or _beyond(_motion(self._last, pose), self._step)):
             self._last = pose
-            self._familiar.append(evidence)
+            evidence = outputs["lens_gradient"][0], outputs["lens_information"][0]
+            self._familiar.add(evidence)
             if _is_clear(outputs["signs"])[0]:
-                self._clear.append(evidence)
-            windows = (self._clear, 1.0), (self._familiar, _WEAK)
-            shown = any(self._pair_differs(*each) for each in windows)
-            self._held = WINDOW if shown else max(0, self._held - 1)
-            self._differs = any(self._window_differs(*each) for each in windows)
+                self._clear.add(evidence)
+            self._judge()
         return self._differs or self._held > 0
 
-    def _window_differs(self, window: deque[Evidence], factor: float) -> bool:
-        if len(window) < WINDOW:
-            return False
-        return bool((np.abs(summed(list(window))) > factor * self._limits).any())
-
-    def _pair_differs(self, window: deque[Evidence], factor: float) -> bool:
-        """Whether the last two frames show a lens that is off by too many deviations."""
-        if len(window) < PAIR:
-            return False
-        pair = [window[-2], window[-1]]
-        beyond = np.abs(summed(pair)) > factor * self._limits
+    def _judge(self) -> None:
+        """Set what whole windows and the last two frames show."""
+        windows = self._clear, self._familiar
+        shown, differs = False, False
+        beyond = np.abs(_lens(np.array([each.sums() for each in windows]))) > self._limits
         # Few frames come this far, so that the covariance costs nothing.
-        return bool(
-            beyond.any() and (beyond & (in_deviations(pair) > factor * self._deviations)).any()
-        )
+        if beyond.any():
+            for window, (pair, whole) in zip(windows, beyond, strict=True):
+                differs |= window.count >= WINDOW and bool(whole.any())
+                if window.count >= PAIR and pair.any():
+                    limits = window.factor * self._deviations
+                    shown |= bool((pair & (in_deviations(window.pair()) > limits)).any())
+        self._held = WINDOW if shown else max(0, self._held - 1)
+        self._differs = differs
 
     def estimate(self) -> LensEstimate | None:
         """Return the camera that the frames show; None if none explains them, or for few frames."""
         if len(self._kept) < WINDOW:
             return None
         # Another thread may be adding a frame.
-        lens, error = self._solver.lens_fit(list(self._kept))
+        frames = [
+            (points, np.exp(log_scale.astype(np.float64)) / self._focal_px, pose)
+            for points, log_scale, pose in list(self._kept)
+        ]
+        lens, error = self._solver.lens_fit(frames)
         if not np.median(error) * self._focal_px <= self._error_px:
             return None
         fx, fy = np.exp(lens[:2]).tolist()
         return LensEstimate(fx, fy, float(lens[2]), len(self._kept))
 
     def _keep(self, outputs: Mapping[str, NDArray[Any]]) -> None:
-        scale = np.exp(outputs["log_scale_px"][0].astype(np.float64)) / self._focal_px
-        pose = outputs["solved_pose"][0]
-        self._kept.append((outputs["coordinates"][0].astype(np.float64), scale, pose))
+        # The engine may use the memory of its outputs again.
+        cells = outputs["coordinates"][0].copy(), outputs["log_scale_px"][0].copy()
+        self._kept.append((*cells, outputs["solved_pose"][0]))
         if len(self._kept) > _KEPT:
             self._kept = self._kept[::2]
             self._stride *= 2
 
 
+class _Window:
+    """The evidence of the newest frames of one kind; limits are wider by its factor."""
+
+    def __init__(self, factor: float) -> None:
+        self.factor, self.count = factor, 0
+        self._ring = np.zeros((WINDOW, 3, 4))
+
+    def add(self, evidence: Evidence) -> None:
+        row = self._ring[self.count % WINDOW]
+        row[:, 3], row[:, :3] = evidence
+        self.count += 1
+
+    def sums(self) -> tuple[Array, Array]:
+        """Return [information, gradient] (3, 4), summed over the last two frames and over all."""
+        last = self.count - 1
+        pair = self._ring[last % WINDOW] + self._ring[(last - 1) % WINDOW]
+        return pair, self._ring.sum(axis=0)
+
+    def pair(self) -> list[Evidence]:
+        """Return the evidence of the last two frames."""
+        last = [self._ring[(self.count - back) % WINDOW] for back in (2, 1)]
+        return [(row[:, 3], row[:, :3]) for row in last]
+
+
+def _lens(sums: Array) -> Array:
+    """Sums [information, gradient] (..., 3, 4) -> the lens they show, (..., 3)."""
+    return np.asarray(np.linalg.solve(sums[..., :3] + _OPEN, sums[..., 3:])[..., 0], np.float64)
+
+
 def summed(evidence: Sequence[Evidence]) -> Array:
     """Gradients (3,) and informations (3, 3) of several frames -> the lens (3,) they show."""
     gradient, information = (np.sum(each, axis=0) for each in zip(*evidence, strict=True))
-    return np.linalg.solve(information + _PRIOR * np.eye(3), gradient)
+    return _lens(np.column_stack([information, gradient]))
 
 
 def in_deviations(evidence: Sequence[Evidence]) -> Array:
@@ -188,7 +217,7 @@ def in_deviations(evidence: Sequence[Evidence]) -> Array:
     In deviations; 0 where they leave it open. A lens that is far off can bend the likelihood
     upwards along the distortion: the deviations of the focal lengths are then those without it.
     """
-    information = np.sum([each for _, each in evidence], axis=0) + _PRIOR * np.eye(3)
+    information = np.sum([each for _, each in evidence], axis=0) + _OPEN
     variance = np.diag(np.linalg.inv(information)).copy()
     alone = np.diag(np.linalg.inv(information[:2, :2]))
     variance[:2] = np.where(variance[:2] > 0.0, variance[:2], alone)
@@ -225,31 +254,37 @@ def fitted_limits(
     log_focal, distortion = np.median(largest, axis=0).tolist()
     most = _DEVIATION_MOST * np.median(deviations, axis=0)
     fx, fy, k1 = np.minimum(_DEVIATION_MARGIN * np.max(deviations, axis=0), most).tolist()
-    metres, radians = step.tolist()
     return LensLimits(
-        _FOCAL_MARGIN * log_focal, _DISTORTION_MARGIN * distortion, (fx, fy, k1), (metres, radians)
+        _FOCAL_MARGIN * log_focal, _DISTORTION_MARGIN * distortion, (fx, fy, k1), step
     )
 
 
-def _motion(pose: Array, other: Array) -> Array:
-    """Return distance, m, and angle, rad, between two poses (7,), as an array (2,)."""
-    cosine = min(1.0, abs(float(pose[3:] @ other[3:])))
-    return np.array([np.linalg.norm(pose[:3] - other[:3]), 2.0 * math.acos(cosine)])
+def _motion(pose: Array, other: Array) -> tuple[float, float]:
+    """Return distance, m, and angle, rad, between two poses (7,)."""
+    tx, ty, tz, x, y, z, w = pose.tolist()
+    ux, uy, uz, a, b, c, d = other.tolist()
+    cosine = min(1.0, abs(x * a + y * b + z * c + w * d))
+    return math.dist((tx, ty, tz), (ux, uy, uz)), 2.0 * math.acos(cosine)
 
 
-def _usual_step(poses: Array, recordings: Sequence[NDArray[np.int64]]) -> Array:
-    """Return a share of the median motion between neighbouring frames of recordings, (2,)."""
+def _beyond(motion: tuple[float, float], step: tuple[float, float]) -> bool:
+    return motion[0] > step[0] or motion[1] > step[1]
+
+
+def _usual_step(poses: Array, recordings: Sequence[NDArray[np.int64]]) -> tuple[float, float]:
+    """Return a share of the median motion between neighbouring frames, in m and rad."""
     steps = [_motion(poses[i], poses[j]) for frames in recordings for i, j in pairwise(frames)]
     if not steps:
-        return np.full(2, _LEAST_STEP)
-    return np.maximum(_STEP_SHARE * np.median(steps, axis=0), _LEAST_STEP)
+        return _LEAST_STEP, _LEAST_STEP
+    metres, radians = np.maximum(_STEP_SHARE * np.median(steps, axis=0), _LEAST_STEP).tolist()
+    return metres, radians
 
 
-def _moved(poses: Array, frames: NDArray[np.int64], step: Array) -> list[int]:
+def _moved(poses: Array, frames: NDArray[np.int64], step: tuple[float, float]) -> list[int]:
     """Return the frames that have moved since the one before them that has."""
     kept: list[int] = []
     for i in frames.tolist():
-        if not kept or (_motion(poses[kept[-1]], poses[i]) > step).any():
+        if not kept or _beyond(_motion(poses[kept[-1]], poses[i]), step):
             kept.append(i)
     return kept
 
