@@ -72,7 +72,7 @@ def read_bundle(
         Folder with ``model.onnx`` and ``calibration.json``.
     cache
         Cache of models optimised for this machine; the first call for a model fills it. If it
-        cannot be used, or the provider is not onnxruntime, the bundle holds the model's bytes.
+        cannot be used, the bundle holds the model's bytes.
     check
         An additional check, e.g. of a signature; called before the model is read.
 
@@ -96,16 +96,14 @@ def read_bundle(
         _check_original(path, calibration, cache, cached)
         return Bundle(calibration, head, cached)
     model = read_model(path, calibration)
-    if cache is not None and calibration.model.provider == "onnxruntime":
+    if cache is not None:
         cached = _cached_now(calibration, model, cache)
     return Bundle(calibration, head, model if cached is None else cached)
 
 
 def cached_model(cache: ModelCache, calibration: Calibration) -> CachedModel | None:
-    """Return the cached model of a calibration, or None; only onnxruntime models are cached."""
-    if calibration.model.provider != "onnxruntime":
-        return None
-    return cache.find(calibration.model.sha256)
+    """Return the cached model of a calibration, for its provider, or None."""
+    return cache.find(calibration.model.sha256, calibration.model.provider)
 
 
 def _check_original(
@@ -130,7 +128,7 @@ def _cached_now(calibration: Calibration, model: bytes, cache: ModelCache) -> Ca
         return None
     spec = calibration.model
     try:
-        plain = Session(model, 1, spec, keep_in=new)
+        plain = open_session(model, 1, spec, keep_in=new)
         expected = plain.run(_feeds(spec.inputs))
     except (ModelError, BundleMismatchError):
         # The disk may be full. A model that the engine refuses is reported without the cache.
@@ -138,17 +136,17 @@ def _cached_now(calibration: Calibration, model: bytes, cache: ModelCache) -> Ca
         return None
     # Two models in memory at once would set the peak of the whole run.
     del plain
-    cache.keep(new, calibration.name, spec.sha256)
-    cached = cache.find(spec.sha256)
+    cache.keep(new, calibration.name, spec.sha256, spec.provider)
+    cached = cached_model(cache, calibration)
     if cached is not None and not _same(cached, spec, expected):
-        cache.forget(spec.sha256)
+        cache.forget(spec.sha256, spec.provider)
         return None
     return cached
 
 
 def _same(cached: CachedModel, spec: ModelSpec, expected: dict[str, np.ndarray]) -> bool:
     try:
-        found = Session(cached, 1, spec).run(_feeds(spec.inputs))
+        found = open_session(cached, 1, spec).run(_feeds(spec.inputs))
     except (ModelError, BundleMismatchError):
         return False
     return all(np.array_equal(found[name], values) for name, values in expected.items())
@@ -171,23 +169,24 @@ def open_session(
     *,
     spinning: bool = True,
     at_once: int = 1,
+    keep_in: Path | None = None,
 ) -> Session:
     """Open a session of the provider that the calibration names.
 
     ``at_once`` is the number of threads that call the session concurrently; see ``Session`` for the
     other parameters. Raises BundleMismatchError if a cached model was built from another model.
     """
-    if isinstance(model, CachedModel) and (model.model_sha256, "onnxruntime") != (
+    if isinstance(model, CachedModel) and (model.model_sha256, model.provider) != (
         expected.sha256,
         expected.provider,
     ):
         raise BundleMismatchError(
             f"cached model: expected sha256 {expected.sha256} for {expected.provider}, found "
-            f"{model.model_sha256} for onnxruntime"
+            f"{model.model_sha256} for {model.provider}"
         )
-    if expected.provider == "openvino" and not isinstance(model, CachedModel):
+    if expected.provider == "openvino":
         # Imported here because the package is optional and large.
         from cvo_edge.engine.openvino import OpenvinoSession
 
-        return OpenvinoSession(model, threads, expected, at_once=at_once)
-    return Session(model, threads, expected, spinning=spinning)
+        return OpenvinoSession(model, threads, expected, at_once=at_once, keep_in=keep_in)
+    return Session(model, threads, expected, spinning=spinning, keep_in=keep_in)

@@ -1,10 +1,11 @@
-"""The model cache: the optimised form that onnxruntime builds from a model on this machine.
+"""The model cache: the optimised form that an engine builds from a model on this machine.
 
 Loading a model means parsing it, optimising its graph for this processor and rearranging its
 weights. The cache stores the result as a folder of two files: the optimised graph, and its weights,
-which the system maps into memory and shares between processes. An entry belongs to one model, one
-release of onnxruntime and one processor, and is used only if its bytes are unchanged. Nobody but
-this user and root may be able to write to it, because digests in an entry can be made to match.
+which the system maps into memory and shares between processes (OpenVINO keeps both in the first).
+An entry belongs to one model, one release of one engine and one processor, and is used only if its
+bytes are unchanged. Nobody but this user and root may be able to write to it, because digests in an
+entry can be made to match.
 
 A failure of the cache never stops a model from running: it only makes the start slower.
 """
@@ -33,6 +34,7 @@ from cvo_edge.bundle.device_record import DeviceRecord
 from cvo_edge.errors import BundleMismatchError, SinkError
 from cvo_edge.files import OTHERS_WRITE, own_folder, untrusted, write_whole
 from cvo_edge.given import given_path
+from cvo_edge.vocabulary import Provider
 
 GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
 SEEN_FILE = "seen.json"
@@ -51,17 +53,17 @@ _UNDECODABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 # Errors that say nothing about the entry itself; reading it later may succeed.
 _PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EACCES)
 # Version of the entry's format and build settings; part of the entry's key.
-_FORM = "4"
+_FORM = "5"
 # Checked model files remembered per entry, e.g. several copies of a bundle.
 _MOST_SEEN = 16
 
 
 class Entry(Struct, frozen=True, forbid_unknown_fields=True):
-    """``entry.json``: model, onnxruntime release, processor, and digests of both files."""
+    """``entry.json``: model, engine with its release, processor, and digests of both files."""
 
     name: str
     model_sha256: str
-    onnxruntime: str
+    engine: str
     processor: str
     graph_sha256: str
     weights_sha256: list[str]
@@ -84,6 +86,7 @@ class CachedModel:
     folder: Path
     graph: bytes
     model_sha256: str
+    provider: Provider
 
 
 class Listed(Struct, frozen=True):
@@ -91,7 +94,7 @@ class Listed(Struct, frozen=True):
 
     name: str
     model_sha256: str
-    onnxruntime: str
+    engine: str
     megabytes: float
     current: bool
 
@@ -127,11 +130,11 @@ class ModelCache:
         cache._seal = record, key
         return cache
 
-    def find(self, model_sha256: str) -> CachedModel | None:
-        """Return the entry of a model, or None; a changed entry is removed."""
+    def find(self, model_sha256: str, provider: Provider = "onnxruntime") -> CachedModel | None:
+        """Return a provider's entry of a model, or None; a changed entry is removed."""
         if self.obstacle() is not None:
             return None
-        folder = self._entry_folder(model_sha256)
+        folder = self._entry_folder(model_sha256, provider)
         try:
             if untrusted(folder.lstat()):
                 raise _not_ours(folder)
@@ -141,8 +144,8 @@ class ModelCache:
             entry = msgspec.json.decode(stated, type=Entry)
             graph = _content(folder / GRAPH_FILE)
             unchanged = (
-                (entry.model_sha256, entry.onnxruntime, entry.processor)
-                == (model_sha256, _onnxruntime_version(), _processor())
+                (entry.model_sha256, entry.engine, entry.processor)
+                == (model_sha256, _engine(provider), _processor())
                 and hashlib.sha256(graph).hexdigest() == entry.graph_sha256
                 and file_digests(folder / WEIGHTS_FILE) == entry.weights_sha256
             )
@@ -153,8 +156,8 @@ class ModelCache:
                 return None
             unchanged = False
         if unchanged:
-            return CachedModel(folder, graph, model_sha256)
-        self.forget(model_sha256)
+            return CachedModel(folder, graph, model_sha256, provider)
+        self.forget(model_sha256, provider)
         return None
 
     def knows(self, cached: CachedModel, model: Path) -> bool:
@@ -182,7 +185,9 @@ class ModelCache:
         except OSError:
             return None
 
-    def keep(self, new: Path, name: str, model_sha256: str) -> None:
+    def keep(
+        self, new: Path, name: str, model_sha256: str, provider: Provider = "onnxruntime"
+    ) -> None:
         """Turn a new folder into an entry, unless another process was faster.
 
         The new folder no longer exists afterwards, even on failure.
@@ -193,7 +198,7 @@ class ModelCache:
             entry = Entry(
                 name=name,
                 model_sha256=model_sha256,
-                onnxruntime=_onnxruntime_version(),
+                engine=_engine(provider),
                 processor=_processor(),
                 graph_sha256=hashlib.sha256((new / GRAPH_FILE).read_bytes()).hexdigest(),
                 weights_sha256=file_digests(new / WEIGHTS_FILE),
@@ -202,12 +207,12 @@ class ModelCache:
             write_whole(new / ENTRY_FILE, stated, own=True)
             if self._seal is not None:
                 # An entry that was found without its seal is not used, and would be in the way.
-                self.forget(model_sha256)
+                self.forget(model_sha256, provider)
                 digest = hashlib.sha256(stated).hexdigest()
                 record, key = self._seal
                 record.keep_prepared(key, model_sha256, digest)
             # The rename is atomic and fails if the entry already exists.
-            new.rename(self._entry_folder(model_sha256))
+            new.rename(self._entry_folder(model_sha256, provider))
         except (OSError, SinkError, BundleMismatchError):
             pass
         finally:
@@ -217,9 +222,9 @@ class ModelCache:
         """Remove a new folder."""
         shutil.rmtree(new, ignore_errors=True)
 
-    def forget(self, model_sha256: str) -> None:
-        """Remove the entry of a model."""
-        shutil.rmtree(self._entry_folder(model_sha256), ignore_errors=True)
+    def forget(self, model_sha256: str, provider: Provider = "onnxruntime") -> None:
+        """Remove a provider's entry of a model."""
+        shutil.rmtree(self._entry_folder(model_sha256, provider), ignore_errors=True)
 
     def entries(self) -> list[Listed]:
         """Return the entries, sorted by name."""
@@ -236,9 +241,9 @@ class ModelCache:
                 Listed(
                     entry.name,
                     entry.model_sha256,
-                    entry.onnxruntime,
+                    entry.engine,
                     size / 1e6,
-                    folder == self._entry_folder(entry.model_sha256),
+                    folder == self._folder_of(entry.model_sha256, _present(entry.engine)),
                 )
             )
         return sorted(found, key=lambda listed: (listed.name, listed.model_sha256))
@@ -294,8 +299,11 @@ class ModelCache:
             if time.time() - path.stat().st_mtime > _STALE_SECONDS:
                 shutil.rmtree(path, ignore_errors=True)
 
-    def _entry_folder(self, model_sha256: str) -> Path:
-        key = "\n".join((_FORM, model_sha256, _onnxruntime_version(), _processor()))
+    def _entry_folder(self, model_sha256: str, provider: Provider) -> Path:
+        return self._folder_of(model_sha256, _engine(provider))
+
+    def _folder_of(self, model_sha256: str, engine: str) -> Path:
+        key = "\n".join((_FORM, model_sha256, engine, _processor()))
         return self.folder / hashlib.sha256(key.encode()).hexdigest()[:32]
 
 
@@ -379,12 +387,24 @@ def file_digests(path: Path) -> list[str]:
     return [found[offset] for offset in sorted(found)]
 
 
-def _onnxruntime_version() -> str:
+def _engine(provider: Provider) -> str:
+    """Return an engine's name and release; the name alone if it is not installed."""
     # Imported here because clearing the cache does not need the engine. Reading the version from
     # the package metadata instead takes as long as opening a small model.
-    from onnxruntime import __version__ as version
+    if provider == "onnxruntime":
+        from onnxruntime import __version__ as version
+    else:
+        try:
+            from openvino import __version__ as version
+        # An older or incomplete installation may raise any exception.
+        except Exception:  # noqa: BLE001
+            return provider
+    return f"{provider} {version}"
 
-    return str(version)
+
+def _present(engine: str) -> str:
+    """Return the installed release of an entry's engine; others are not imported."""
+    return _engine("openvino" if engine.startswith("openvino") else "onnxruntime")
 
 
 def _processor() -> str:

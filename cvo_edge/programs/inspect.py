@@ -239,7 +239,7 @@ def cache_lines(cache: ModelCache) -> list[str]:
     if obstacle is not None:
         lines += _entry("not used", obstacle)
     for entry in entries:
-        made = f"sha256 {entry.model_sha256[:16]}..., onnxruntime {entry.onnxruntime}"
+        made = f"sha256 {entry.model_sha256[:16]}..., {entry.engine}"
         other = "" if entry.current else ", for another machine or release"
         lines += _entry(f"{entry.megabytes:9.1f} MB", f"{entry.name} ({made}{other})")
     return lines

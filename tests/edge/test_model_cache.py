@@ -149,7 +149,7 @@ def test_a_missing_file_is_a_missing_entry(file, bundle_dir, bundle, cache):
     assert cache.find(bundle.calibration.model.sha256) is None
 
 
-@pytest.mark.parametrize("key", ["model_sha256", "onnxruntime", "processor"])
+@pytest.mark.parametrize("key", ["model_sha256", "engine", "processor"])
 def test_an_entry_of_something_else_is_not_used(key, bundle_dir, bundle, cache):
     read_bundle(bundle_dir, cache=cache)
     path = entry_folder(cache) / ENTRY_FILE

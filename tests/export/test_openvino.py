@@ -14,7 +14,7 @@ from onnx import TensorProto, helper
 from cvo_edge.bundle.format import TensorSpec
 from cvo_edge.bundle.reading import read_calibration
 from cvo_edge.engine.loading import read_bundle
-from cvo_edge.engine.model_cache import ModelCache
+from cvo_edge.engine.model_cache import CachedModel, ModelCache
 from cvo_edge.engine.openvino import OpenvinoSession
 from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.errors import ModelError
@@ -110,10 +110,32 @@ def test_workers_beside_each_other_give_what_one_gives(of_openvino):
         np.testing.assert_allclose(a.pose.t_m, b.pose.t_m, atol=1e-6)
 
 
-def test_its_models_are_not_prepared_for_the_other_engine(of_openvino, tmp_path):
+def test_a_compiled_model_is_kept_and_computes_the_very_same(of_openvino, eight, tmp_path):
+    """The model file is that of the other bundle; each engine has its own entry."""
     cache = ModelCache(tmp_path / "cache")
-    assert isinstance(read_bundle(of_openvino, cache=cache).model, bytes)
-    assert cache.entries() == []
+    for _ in ("compiled", "found"):
+        prepared = read_bundle(of_openvino, cache=cache)
+        assert isinstance(prepared.model, CachedModel)
+    assert read_bundle(eight, cache=cache).model.provider == "onnxruntime"
+    engines = sorted(entry.engine.split()[0] for entry in cache.entries() if entry.current)
+    assert engines == ["onnxruntime", "openvino"]
+    for threads in (1, 2):
+        with Odometer(prepared, threads=threads) as kept, Odometer.load(of_openvino) as plain:
+            # By default it would compute in bfloat16 where the processor can.
+            precision = kept.session.engine.get_property("INFERENCE_PRECISION_HINT")
+            assert precision == openvino.Type.f32
+            for image in images(3):
+                expected, found = plain.step(image), kept.step(image)
+                np.testing.assert_allclose(found.pose.t_m, expected.pose.t_m, atol=1e-6)
+                np.testing.assert_allclose(found.upper, expected.upper, atol=1e-6)
+
+
+def test_an_input_of_another_form_is_refused(of_openvino):
+    with Odometer.load(of_openvino) as odometer:
+        spec = odometer.session.inputs[0]
+        for image in (np.zeros((1, 1, 1, 3), np.uint8), np.zeros(spec.shape, np.float32)):
+            with pytest.raises(ModelError, match="inference failed"):
+                odometer.session.run({spec.name: image})
 
 
 def test_without_the_package_one_line_says_what_to_install(of_openvino):
