@@ -73,6 +73,7 @@ bench: $(VENV)/.installed ## measure speed, memory and start-up against other en
 	$(VENV)/bin/python bench/networks.py
 	$(VENV)/bin/python bench/frame.py
 	$(VENV)/bin/python bench/stream.py
+	$(VENV)/bin/python bench/stages.py
 	$(VENV)/bin/python bench/four_cameras.py
 	$(VENV)/bin/python bench/start.py
 	$(VENV)/bin/python bench/scaling.py

@@ -231,6 +231,16 @@ def against(results: dict[str, Any]) -> Rows:
         ]
 
 
+def stages(results: dict[str, Any]) -> Rows:
+    """Where the time of a frame goes; a stage's parts follow it."""
+    yield ["us", *results]
+    for stage in dict.fromkeys(stage for found in results.values() for stage in found):
+        *outer, name = stage.split("/")
+        found = [rows.get(stage) for rows in results.values()]
+        indent = "&nbsp;&nbsp;" * len(outer)
+        yield [indent + name, *("-" if us is None else number(us, 0) for us in found)]
+
+
 # Program -> the tables of its results.
 _TABLES: dict[str, tuple[Callable[[dict[str, Any]], Rows], ...]] = {
     "frame": (frame, precision),
@@ -241,6 +251,7 @@ _TABLES: dict[str, tuple[Callable[[dict[str, Any]], Rows], ...]] = {
     "scaling": (scaling, confidences),
     "soak": (memory,),
     "against": (against,),
+    "stages": (stages,),
 }
 
 

@@ -20,6 +20,7 @@ def test_every_program_has_its_results_and_no_figure_is_left_open() -> None:
         "peers",
         "scaling",
         "soak",
+        "stages",
         "start",
         "stream",
         "uncertainty_peers",
