@@ -218,6 +218,29 @@ def board(figures: dict[str, Any]) -> Rows:
             ]
 
 
+def instructions(counts: list[dict[str, Any]]) -> Rows:
+    """Millions of instructions of the network by kind, and float32 over 8 bits."""
+    kinds = list(counts[0]["network"])
+    yield [
+        *("processor", "bundle", *kinds, "network", "float32 / 8 bits", "step"),
+        "float32 / 8 bits",
+    ]
+    for row in counts:
+        (plain,) = [
+            each
+            for each in counts
+            if (each["processor"], each["bundle"])
+            == (row["processor"], row["bundle"].removesuffix("-int8"))
+        ]
+        totals = []
+        for part in ("network", "step"):
+            total = sum(row[part].values())
+            share = sum(plain[part].values()) / total
+            totals += [f"{total:.1f}", "-" if row is plain else f"{share:.2f}"]
+        by_kind = (f"{row['network'][kind]:.1f}" for kind in kinds)
+        yield [row["processor"], row["bundle"], *by_kind, *totals]
+
+
 def against(results: dict[str, Any]) -> Rows:
     """Array to interval of two checkouts."""
     other = "of the other checkout"
@@ -267,6 +290,12 @@ def board_table(name: str) -> str:
     return table(head, body)
 
 
+def instructions_table() -> str:
+    """Return the table of instructions on emulated ARM processors."""
+    head, *body = instructions(read_result("boards", "instructions")["counts"])
+    return table(head, body)
+
+
 # Name of a table -> what makes it.
 TABLES: dict[str, Callable[[], str]] = {
     **{
@@ -276,4 +305,5 @@ TABLES: dict[str, Callable[[], str]] = {
     },
     "board-arm64": partial(board_table, "arm64"),
     "board-avx2": partial(board_table, "avx2"),
+    "instructions": instructions_table,
 }

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cvo_edge.vocabulary import Precision
 
@@ -44,6 +44,19 @@ CPU part\t: 0x{part:x}
 CPU revision\t: {revision}
 
 """
+
+
+class ArmProcessor(NamedTuple):
+    """What ``/proc/cpuinfo`` says of an ARM processor."""
+
+    features: str
+    variant: int
+    part: int
+    revision: int
+
+
+# Revision r0p3, with the features of qemu's.
+CORTEX_A72 = ArmProcessor("fp asimd evtstrm aes pmull sha1 sha2 crc32 cpuid", 0, 0xD08, 3)
 
 
 class SetUpError(Exception):
@@ -176,8 +189,8 @@ def _install_emulator(board: Board) -> None:
             f"{board.emulator}: not found; install the package qemu-user-static, or run this as "
             "root on a system with apt-get"
         )
-    _call("apt-get", "-qq", "update")
-    _call("apt-get", "-qq", "-y", "--no-install-recommends", "install", "qemu-user-static")
+    call("apt-get", "-qq", "update")
+    call("apt-get", "-qq", "-y", "--no-install-recommends", "install", "qemu-user-static")
 
 
 def _extract_debian(folder: Path, root: Path) -> None:
@@ -204,25 +217,22 @@ def _extract_debian(folder: Path, root: Path) -> None:
         "Dir::Etc::preferencesparts": "/dev/null",
     }
     apt = ["apt-get", "-qq", *(f"--option={key}={value}" for key, value in settings.items())]
-    _call(*apt, "update")
+    call(*apt, "update")
     download = ["--yes", "--no-install-recommends", "--download-only", "install"]
-    _call(*apt, *download, f"python{_DEBIAN_PYTHON}", "libstdc++6")
+    call(*apt, *download, f"python{_DEBIAN_PYTHON}", "libstdc++6")
     for package in sorted((work / "cache" / "archives").glob("*.deb")):
-        _call("dpkg-deb", "--extract", str(package), str(partial))
+        call("dpkg-deb", "--extract", str(package), str(partial))
     # onnxruntime reads /proc/cpuinfo on import and crashes if it describes an x86 processor.
     (partial / "proc").mkdir()
-    (partial / "proc" / "cpuinfo").write_text(_arm_cpuinfo(os.cpu_count() or 1), "ascii")
+    (partial / "proc" / "cpuinfo").write_text(arm_cpuinfo(os.cpu_count() or 1, CORTEX_A72), "ascii")
     shutil.rmtree(work)
     partial.rename(root)
 
 
-def _arm_cpuinfo(cores: int) -> str:
-    """Return ``/proc/cpuinfo`` of a Cortex-A72, revision r0p3, with the features of qemu's."""
-    features = "fp asimd evtstrm aes pmull sha1 sha2 crc32 cpuid"
-    return "".join(
-        _PROCESSOR.format(number=number, features=features, variant=0, part=0xD08, revision=3)
-        for number in range(cores)
-    )
+def arm_cpuinfo(cores: int, processor: ArmProcessor) -> str:
+    """Return ``/proc/cpuinfo`` of a processor."""
+    told = processor._asdict()
+    return "".join(_PROCESSOR.format(number=number, **told) for number in range(cores))
 
 
 def _arm_wheel_options() -> list[str]:
@@ -256,11 +266,12 @@ def _install_packages(folder: Path, site: Path, wheels: list[str]) -> None:
     (folder / "constraints.txt").write_text(same, "utf-8")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-compile", f"--target={site}"]
     files = (f"{folder}/requirements.txt", f"--constraint={folder}/constraints.txt")
-    _call(*pip, *wheels, "--requirement", *files)
+    call(*pip, *wheels, "--requirement", *files)
     stamp.write_text(state, "ascii")
 
 
-def _call(*command: str) -> None:
+def call(*command: str) -> None:
+    """Run a command; raises SetUpError with the last line that it said if it fails."""
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode != 0:
