@@ -30,6 +30,7 @@ from cvo_edge.estimate import PoseInterval
 from cvo_edge.input import image_files, preprocess
 from cvo_edge.input.frame import Frame, Source
 from cvo_edge.input.frame_checks import Look
+from cvo_edge.input.half import halve
 from cvo_edge.input.image_checks import KnownImages
 from cvo_edge.input.repetition import Repetition
 from cvo_edge.monitor.alarm import StreamAlarm
@@ -169,6 +170,10 @@ class Timed:
     def __init__(self, source: Source, spans: Spans) -> None:
         self.length, self.live = source.length, source.live
         self._source, self._spans = source, spans
+
+    def halve(self) -> None:
+        """Decode at half size; raises UsageError if the source cannot."""
+        halve(self._source)
 
     def reads(self) -> Iterator[Callable[[], Frame]]:
         """Yield a timed call for each frame."""

@@ -10,6 +10,7 @@ import pytest
 
 from cvo_edge import Odometer, open_source
 from cvo_edge.errors import BundleMismatchError, GateError, SourceError, UsageError
+from cvo_edge.input.half import halve
 from cvo_edge.programs import bench_page, regressions, script, stages
 from cvo_edge.programs.bench import benchmark
 from cvo_edge.programs.cli import app
@@ -203,6 +204,13 @@ def test_every_stage_is_found_and_nothing_stays_timed(artifacts_dir, clip_dir, m
     if mode == "latency":
         assert sum(row["mean_us"] for row in outermost) <= 1.001 * found["record_every_us"]
     assert len(list(stages.stage_lines(found, mode))) == len(found["rows"]) + 3
+
+
+def test_a_timed_source_decodes_at_half_size_where_a_bundle_needs_it(clip_dir):
+    sources = [stages.Timed(open_source(str(clip_dir)), stages.Spans()) for _ in range(2)]
+    halve(sources[1])
+    whole, half = (next(iter(source)).image.shape for source in sources)
+    assert half == (whole[0] // 2, whole[1] // 2, 3)
 
 
 class Opened(HTMLParser):
