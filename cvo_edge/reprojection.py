@@ -56,10 +56,12 @@ class Cells:
         self._points[3] = 1.0
         np.multiply(points.T, 1.0 / unit, out=self._points[:3], dtype=np.float64)
         self.rows = np.zeros((10, 2, count))
-        # Views of the motions along x and y where they are not zero, and of what a turn about x or
-        # y adds to the middle of the image.
+        # Views of the rows, without the zeros of the first two; ``_middle`` is what a turn about x
+        # or y adds to the middle of the image.
         self._sideways = self.rows[:2].reshape(4, count)[::3]
-        self._middle = self.rows[3:5].reshape(4, count)[1:3]
+        self._forward, self._tilt, self._roll = self.rows[2], self.rows[3:5], self.rows[5]
+        self._middle = self._tilt.reshape(4, count)[1:3]
+        self._error = self.rows[ERROR]
 
     def best(self, poses: Array) -> int:
         """Return which of the poses (3, k, 4), the rows of k ``T_camera_world``, fits best."""
@@ -71,17 +73,18 @@ class Cells:
 
     def project(self, T: Array) -> None:
         """Write the rows of the pose and the error at ``T_camera_world`` (3, 4)."""
-        rows, Y = self.rows, T @ self._points
-        inverse = 1.0 / np.maximum(Y[2], _NEAR)
-        self.ahead, self.image = Y[2] > _NEAR, Y[:2] * inverse
-        image = self.image
+        Y = T @ self._points
+        depth = Y[2]
+        self.ahead = depth > _NEAR
+        inverse = 1.0 / np.maximum(depth, _NEAR)
+        self.image = image = Y[:2] * inverse
         np.negative(inverse, out=self._sideways)
-        np.multiply(image, inverse, out=rows[2])
+        np.multiply(image, inverse, out=self._forward)
         # (v, -u), whose products with u and v are the other turns.
-        np.multiply(image[::-1], _SIGNS, out=rows[5])
-        np.multiply(rows[5][:, np.newaxis], image, out=rows[3:5])
+        np.multiply(image[::-1], _SIGNS, out=self._roll)
+        np.multiply(self._roll[:, np.newaxis], image, out=self._tilt)
         self._middle += _SIGNS
-        error = np.subtract(image, self._rays, out=rows[ERROR])
+        error = np.subtract(image, self._rays, out=self._error)
         error = error * error
         self.squared = error[0] + error[1]
 
@@ -115,7 +118,7 @@ class Cells:
         if not newton:
             return (products,)
         # The weights fall with the error: second term of the Hessian.
-        along = weighted * rows[ERROR]
+        along = weighted * self._error
         pull = along[:, 0] + along[:, 1]
         pull[ERROR] = 0.0
         return products - (2.0 / (NU + 2.0) * pull) @ pull.T, products

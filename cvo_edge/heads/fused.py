@@ -13,6 +13,7 @@ network that regresses has learned one camera: with another one, it is left out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
@@ -28,7 +29,6 @@ from cvo_edge.heads.base import Candidate
 from cvo_edge.heads.scr import LOST, ScrHead, ScrParameters
 from cvo_edge.input.view import SeenCamera
 from cvo_edge.pose import Chart
-from cvo_edge.pose_solver import Solution
 
 Array = NDArray[np.float64]
 
@@ -79,23 +79,28 @@ class FusedHead(ScrHead):
         self.outputs = {**self.outputs, "regression": (1, 7), "half_width": (1, 6)}
 
     def combined(
-        self, outputs: Mapping[str, NDArray[Any]], found: Solution, seen: SeenCamera
+        self,
+        outputs: Mapping[str, NDArray[Any]],
+        solved: Array,
+        information: Array,
+        seen: SeenCamera,
     ) -> tuple[Array, Array, dict[str, Array]]:
         """As ``ScrHead``: the fused pose.
 
         Adds the solver's information ``solved`` (1, 6, 6) and, where both poses are used, their
         ``disagreement`` (1, 1).
         """
-        added = {"solved": found.information[np.newaxis]}
+        added = {"solved": information[np.newaxis]}
         fusion = self.parameters.fusion
         if fusion is None:
-            return found.pose, found.information, added
+            return solved, information, added
         if fusion.share == 0.0 or not seen.learned:
-            return found.pose, fusion.kappa * found.information, added
-        regression = np.asarray(outputs["regression"][0], np.float64)
-        regression[3:] = geometry.quaternion_normalise(regression[3:])
+            return solved, fusion.kappa * information, added
+        regression = outputs["regression"][0].astype(np.float64)
+        # A zero quaternion is no rotation, and gives NaN.
+        regression[3:] /= math.hypot(*regression[3:].tolist()) or math.nan
         pose, information, disagreement = fuse(
-            found.pose, found.information, regression, outputs["half_width"][0], fusion
+            solved, information, regression, outputs["half_width"][0], fusion
         )
         return pose, information, {**added, "disagreement": np.array([[disagreement]])}
 
@@ -165,18 +170,31 @@ def fuse(
     """
     H = fusion.kappa * information
     D = fusion.share / np.square(np.array(fusion.rho) * np.maximum(half_width, 1e-12))
-    offset = _offset(regression, solved)
+    # As ``_offset``, in a tenth of the time.
+    offset = Chart("tangent_reference", solved[3:]).point(regression)
+    offset[:3] -= solved[:3]
     total = H + np.diag(D)
     step = np.linalg.solve(total, D * offset)
     rest = offset - step
     disagreement = (float(step @ H @ step) + float(rest @ (D * rest))) / 6.0
-    pose = np.concatenate(
-        [
-            solved[:3] + step[:3],
-            geometry.quaternion_multiply(solved[3:], geometry.quaternion_exp(step[3:])),
-        ]
-    )
+    position = (solved[:3] + step[:3]).tolist()
+    pose = np.array([*position, *_turned(*solved[3:].tolist(), *step[3:].tolist())])
     return pose, total / max(1.0, disagreement), disagreement
+
+
+def _turned(
+    x: float, y: float, z: float, w: float, a: float, b: float, c: float
+) -> tuple[float, float, float, float]:
+    """Quaternion x y z w, then the rotation vector a b c, rad, about its axes -> quaternion."""
+    angle = math.sqrt(a * a + b * b + c * c)
+    factor, d = math.sin(0.5 * angle) / angle if angle > 0.0 else 0.5, math.cos(0.5 * angle)
+    a, b, c = factor * a, factor * b, factor * c
+    return (
+        w * a + x * d + y * c - z * b,
+        w * b - x * c + y * d + z * a,
+        w * c + x * b - y * a + z * d,
+        w * d - x * a - y * b - z * c,
+    )
 
 
 def _disagreement_limit(known: Mapping[str, NDArray[Any]], fusion: Fusion) -> float | None:

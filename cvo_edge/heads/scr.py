@@ -36,7 +36,7 @@ from cvo_edge.errors import CalibrationFileError, UsageError
 from cvo_edge.heads.base import Candidate, Head, Limit, Solved, Solver
 from cvo_edge.heads.cqr import below_spread, infinite_where_null, refuse_negative
 from cvo_edge.input.view import SeenCamera
-from cvo_edge.pose_solver import PoseSolver, Solution, dispersion
+from cvo_edge.pose_solver import PoseSolver, dispersion
 from cvo_edge.record import Reason
 from cvo_edge.sets import ConformalSet, Ellipsoids, scaled_distance, unbounded_set
 from cvo_edge.vocabulary import Joint, Scope
@@ -184,8 +184,6 @@ class ScrHead(Head):
         """
         seen = _stated(seen)
         pose_solver, limits = self._pose_solver(seen), self.parameters.limits
-        # The scales that the network predicts have been calibrated for the learned camera only.
-        steps = (1,) if seen.learned else (1, _CONVERGED_STEPS)
         focal_px, cells = seen.camera.focal_px, math.prod(self.parameters.grid)
         count = max(1, round(min(BEST_CELLS, cells) * pose_solver.seen.mean()))
         whole = bool(pose_solver.seen.all())
@@ -201,9 +199,13 @@ class ScrHead(Head):
             error_px = focal_px * math.sqrt(_median(squared * np.square(scale[best])))
             contradicting = np.count_nonzero(squared > _CONTRADICTS**2) / count
             seen_squared = found.squared if whole else found.squared[pose_solver.seen]
-            factor = max(dispersion(seen_squared, n) for n in steps)
-            found = found._replace(information=found.information / factor)
-            pose, information, added = self.combined(outputs, found, seen)
+            factor = dispersion(seen_squared, 1)
+            # The network's scales have been calibrated for the learned camera only.
+            if not seen.learned:
+                factor = max(factor, dispersion(seen_squared, _CONVERGED_STEPS))
+            pose, information, added = self.combined(
+                outputs, found.pose, found.information / factor, seen
+            )
             # Without full information, there is no covariance.
             certain, covariance = cv2.invert(information, flags=cv2.DECOMP_CHOLESKY)
             solved = {
@@ -265,10 +267,14 @@ class ScrHead(Head):
         return solver
 
     def combined(
-        self, outputs: Mapping[str, NDArray[Any]], found: Solution, seen: SeenCamera
+        self,
+        outputs: Mapping[str, NDArray[Any]],
+        solved: Array,
+        information: Array,
+        seen: SeenCamera,
     ) -> tuple[Array, Array, dict[str, Array]]:
         """Return pose (7,), information (6, 6) and further outputs; by default the solver's."""
-        return found.pose, found.information, {}
+        return solved, information, {}
 
     def doubted(self, added: Mapping[str, Array]) -> bool:
         """Return whether what ``combined`` added speaks against the frame; by default, no."""
