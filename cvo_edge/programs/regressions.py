@@ -204,10 +204,11 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
         f"beside {comparison.earlier}; regressions: ratios and memory beyond {tolerance:.0%}, "
         f"times beyond {_TIMES * tolerance:.0%}"
     )
-    yield f"{'':<40}{'old':>10}{'new':>10}{'new/old':>9}"
+    wide = 2 + max(len(each.name) for each in comparison.figures)
+    yield f"{'':<{wide}}{'old':>10}{'new':>10}{'new/old':>9}"
     for each in comparison.figures:
         mark = "  regression" if each.regression else ""
-        yield f"{each.name:<40}{each.old:>10.3f}{each.new:>10.3f}{each.ratio:>9.3f}{mark}"
+        yield f"{each.name:<{wide}}{each.old:>10.3f}{each.new:>10.3f}{each.ratio:>9.3f}{mark}"
     for difference in comparison.differences:
         yield f"not comparable: {difference}"
 
