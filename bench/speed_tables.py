@@ -131,13 +131,14 @@ def process(results: dict[str, Any]) -> Rows:
 
 def peers(results: dict[str, Any]) -> Rows:
     """Other engines."""
-    yield ["network", "engine", "", "ms", "/ ours", "largest difference"]
+    yield ["network", "engine", "", "ms", "/ ours", "/ OpenVINO int8", "largest difference"]
     for name in BACKBONES:
         for engine, row in results[name].items():
             difference = row.get("largest_difference")
             cells = [two(row["ms"]), two(row["over_ours"])] if "ms" in row else ["not timed", "-"]
             off = "-" if difference is None else f"{difference:.1e}"
-            yield [SHORT[name], engine, row["precision"], *cells, off]
+            beside = two(row["over_openvino"]) if "over_openvino" in row else "-"
+            yield [SHORT[name], engine, row["precision"], *cells, beside, off]
 
 
 def uncertainty(results: dict[str, Any]) -> Rows:
