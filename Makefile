@@ -78,6 +78,7 @@ bench: $(VENV)/.installed ## measure speed, memory and start-up against other en
 	$(VENV)/bin/python bench/start.py
 	$(VENV)/bin/python bench/scaling.py
 	$(VENV)/bin/python bench/peers.py
+	$(VENV)/bin/python bench/decoders.py
 	$(VENV)/bin/python bench/uncertainty_peers.py
 	$(VENV)/bin/python bench/goals.py
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import accuracy_tables
 import comparison_tables
+import decoder_tables
 import localiser_tables
 import message_tables
 import motion_tables
@@ -51,6 +52,7 @@ def faults() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     **accuracy_tables.TABLES,
     **comparison_tables.TABLES,
+    **decoder_tables.TABLES,
     **study_tables.TABLES,
     **localiser_tables.TABLES,
     **speed_tables.TABLES,

@@ -228,7 +228,8 @@ class Odometer(Labelled):
             Shape (height, width, 3), uint8, BGR, in the sensor's pixel order, as read by
             ``cv2.imread`` with ``cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION``; grey images,
             alpha channels and 16 bits are converted. None, or anything but an image, gives an
-            ``invalid`` estimate.
+            ``invalid`` estimate. A bundle of ``decode: half`` needs JPEG files that were read with
+            ``cv2.IMREAD_REDUCED_COLOR_2`` instead of ``cv2.IMREAD_COLOR``.
         stamp_ns
             Time of the image in integer nanoseconds; copied to the result.
         source

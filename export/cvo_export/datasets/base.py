@@ -176,7 +176,8 @@ class PoseDataset:
             else:
                 return replace(self, read_image=self.read_half, read_whole=self.read_image)
         raise UsageError(
-            f"decode: expected JPEG files to decode at half size in {self.name}, found {found}"
+            f"decode: expected JPEG files in {self.name} to decode at half size, found {found}; "
+            "use --decode full"
         )
 
     def read_changed(
