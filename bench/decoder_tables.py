@@ -9,7 +9,7 @@ import numpy as np
 from markdown_table import table
 from provenance import read_result
 
-DATA = {"room": "synthetic room, new flights", "kitchen": "redkitchen, known walk"}
+DATA = {"room": "synthetic room, new flights"}
 READ = {"half": "at half size", "means": "whole, then halved"}
 
 
@@ -47,7 +47,7 @@ def _bundles(name: str) -> Iterator[list[str]]:
                 f"{np.mean(marginal['coverage']):.3f}, {joint['joint_coverage']:.3f}",
                 _width(marginal),
                 f"{marginal['normalised_interval_score']:.3f}",
-                "" if way == own else f"{moved['median']:.4f} ({moved['p99']:.4f})",
+                "" if way == own else f"{moved['median']:.3f} ({moved['p99']:.3f})",
             ]
 
 
