@@ -1,10 +1,14 @@
 """Backbones: truncated and pooled timm models, pooling against torch, invalid weights."""
 
+import onnx
 import pytest
 import torch
 from safetensors.torch import save_file
+from timm.models.repvit import RepVggDw
 
+from cvo_edge.engine.session import Session
 from cvo_edge.errors import UsageError
+from cvo_export.graph.to_onnx import check_parity, export_onnx
 from cvo_export.networks.backbone import Backbone, BackboneConfig, load_weights
 
 
@@ -81,3 +85,22 @@ def test_wrong_weights_are_refused(tmp_path):
     save_file({"conv_stem.weight": torch.zeros(1)}, path)
     with pytest.raises(UsageError, match="tensors missing and 1 of another shape"):
         load_weights(backbone(), str(path))
+
+
+def test_branches_for_training_become_one_convolution_in_the_exported_graph():
+    class Tuple(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.block = RepVggDw(8, 3, legacy=False)
+
+        def forward(self, x):
+            return (self.block(x),)
+
+    torch.manual_seed(0)
+    made = Tuple()
+    made(torch.randn(16, 8, 12, 16))  # statistics of the normalisations
+    image = torch.randn(1, 8, 12, 16)
+    content = export_onnx(made, [image], ["x"], ["y"])
+    assert [node.op_type for node in onnx.load_from_string(content).graph.node] == ["Conv"]
+    assert count(made) > count(made.block.conv.c)  # the network itself still has its branches
+    check_parity(made, Session(content), [{"x": image.numpy()}], ["x"], ["y"])

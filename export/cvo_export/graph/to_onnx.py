@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from onnxscript import opset18 as op
+from timm.utils.model import reparameterize_model
 from torch import Tensor, nn
 
 from cvo_edge.engine.session import Session
@@ -42,8 +43,12 @@ def export_onnx(
     input_names: Sequence[str],
     output_names: Sequence[str],
 ) -> bytes:
-    """Export a module for inputs of exactly these shapes; returns the content of an ONNX file."""
-    module.eval()
+    """Export a module for inputs of exactly these shapes; returns the content of an ONNX file.
+
+    Branches that a network has for training alone (RepViT, MobileOne, FastViT) become one
+    convolution, in a copy.
+    """
+    module = reparameterize_model(module.eval())
     # The exporter reports its progress on stdout, which is reserved for our data, and to a logger.
     exporter_log = logging.getLogger("torch.onnx")
     level = exporter_log.level
