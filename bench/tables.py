@@ -24,6 +24,7 @@ import localiser_tables
 import message_tables
 import motion_tables
 import odometry_tables
+import pareto_tables
 import promised_table
 import reconstruct_tables
 import recording_tables
@@ -61,6 +62,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **message_tables.TABLES,
     **motion_tables.TABLES,
     **odometry_tables.TABLES,
+    **pareto_tables.TABLES,
     **recording_tables.TABLES,
     **reconstruct_tables.TABLES,
     **service_tables.TABLES,
