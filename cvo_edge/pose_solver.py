@@ -159,7 +159,7 @@ class PoseSolver:
         return float(max(np.abs(found[:3] / self._unit + R @ T[:, 3]).max(), turned))
 
     def _cells(self, points: NDArray[np.floating], scale: Array) -> Cells:
-        spread = NU * np.square(scale, dtype=np.float64)
+        spread = NU * scale.astype(np.float64) ** 2
         if not self._whole:
             spread = np.where(self.seen, spread, np.inf)
         return Cells(points, spread, self._rays, self._unit)
@@ -190,7 +190,7 @@ class PoseSolver:
     def _length(self, information: Array, gradient: Array) -> float:
         """Return a step's length in deviations, as if it had not been damped."""
         solved, undamped = cv2.solve(information - self._precision, gradient, flags=cv2.DECOMP_LU)
-        squared = float(np.vdot(undamped, gradient))
+        squared = float(undamped[:, 0] @ gradient[:, 0])
         return math.sqrt(squared) if solved and squared >= 0.0 else math.inf
 
     def lens_fit(self, frames: Sequence[tuple[Array, Array, Array]]) -> LensFit:

@@ -53,8 +53,9 @@ class Cells:
         count = rays.shape[1]
         self.spread, self._rays = spread, rays
         self._points = np.empty((4, count))
+        self._points[:3] = points.T
+        self._points[:3] *= 1.0 / unit
         self._points[3] = 1.0
-        np.multiply(points.T, 1.0 / unit, out=self._points[:3], dtype=np.float64)
         self.rows = np.zeros((10, 2, count))
         # Views of the rows, without the zeros of the first two; ``_middle`` is what a turn about x
         # or y adds to the middle of the image.
@@ -66,10 +67,14 @@ class Cells:
     def best(self, poses: Array) -> int:
         """Return which of the poses (3, k, 4), the rows of k ``T_camera_world``, fits best."""
         Y = (poses.reshape(-1, 4) @ self._points).reshape(3, poses.shape[1], -1)
-        error = Y[:2] / np.maximum(Y[2], _NEAR) - self._rays[:, np.newaxis]
+        error, depth = Y[:2], Y[2]
+        # In place: the inference has emptied the caches.
+        error /= np.maximum(depth, _NEAR)
+        error -= self._rays[:, np.newaxis]
         error *= error
-        squared = np.where(Y[2] > _NEAR, error[0] + error[1], _BEHIND_SQUARED)
-        return int(np.log1p(squared / self.spread).sum(axis=1).argmin())
+        squared = np.where(depth > _NEAR, error[0] + error[1], _BEHIND_SQUARED)
+        squared /= self.spread
+        return int(np.log1p(squared, out=squared).sum(axis=1).argmin())
 
     def project(self, T: Array) -> None:
         """Write the rows of the pose and the error at ``T_camera_world`` (3, 4)."""
@@ -78,7 +83,7 @@ class Cells:
         self.ahead = depth > _NEAR
         inverse = 1.0 / np.maximum(depth, _NEAR)
         self.image = image = Y[:2] * inverse
-        np.negative(inverse, out=self._sideways)
+        np.multiply(inverse, -1.0, out=self._sideways)
         np.multiply(image, inverse, out=self._forward)
         # (v, -u), whose products with u and v are the other turns.
         np.multiply(image[::-1], _SIGNS, out=self._roll)

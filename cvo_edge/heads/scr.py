@@ -191,12 +191,12 @@ class ScrHead(Head):
         def solve(outputs: Mapping[str, NDArray[Any]]) -> Solved:
             log_scale = outputs["log_scale_px"][0]
             within = np.minimum(np.maximum(log_scale, -_LARGEST_LOG), _LARGEST_LOG)
-            scale = np.exp(within, dtype=np.float64) / focal_px
+            scale = np.exp(within.astype(np.float64)) / focal_px
             found = pose_solver.solve(outputs["coordinates"][0], scale)
             shown = log_scale if whole else np.where(pose_solver.seen, log_scale, np.inf)
             best = shown.argpartition(count - 1)[:count]
             squared = found.squared[best]
-            error_px = focal_px * math.sqrt(_median(squared * np.square(scale[best])))
+            error_px = focal_px * math.sqrt(_median(squared * scale[best] ** 2))
             contradicting = np.count_nonzero(squared > _CONTRADICTS**2) / count
             seen_squared = found.squared if whole else found.squared[pose_solver.seen]
             factor = dispersion(seen_squared, 1)
