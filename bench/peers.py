@@ -38,6 +38,9 @@ LARGEST_DIFFERENCE, LARGEST_SHARE = 1e-3, 0.1
 # How much more than our own 8 bits another reduced precision may change the outputs.
 LARGEST_ROUNDING = 5.0
 
+# What is compared. Graphs of bundles have an alarm, too, which other forms of the network lack.
+OUTPUTS = ("pose", "lower", "upper")
+
 Outputs = list[NDArray[np.float32]]
 Call = Callable[[preprocess.Image], Outputs]
 
@@ -99,7 +102,7 @@ def onnxruntime_defaults(network: Network, precision: str) -> Call:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = THREADS
     session = onnxruntime.InferenceSession(network.onnx(precision), options)
-    return lambda image: session.run(None, {"image": image})
+    return lambda image: session.run(OUTPUTS, {"image": image})
 
 
 def torch_eager(network: Network) -> Call:
@@ -233,7 +236,7 @@ def network_of(odometer: Odometer) -> Call:
     if odometer.session is None:
         raise SystemExit("expected an open odometer, found a closed one")
     engine = odometer.session.engine
-    return lambda image: engine.run(["pose", "lower", "upper"], {"image": image})
+    return lambda image: engine.run(OUTPUTS, {"image": image})
 
 
 def measured(backbone: str, peers: dict[str, Peer]) -> dict[str, Any]:
