@@ -243,6 +243,9 @@ def test_whatever_the_bytes_it_is_none_or_the_picture_of_the_header(data, suffix
     if image is not None:
         assert image.dtype == np.uint8
         assert image.shape == (*image_size(bytes(content)), 3)
+    small = decode_image(bytes(content), decode="half")
+    if small is not None:
+        assert small.shape == (*((side + 1) // 2 for side in image_size(bytes(content))), 3)
 
 
 @settings(max_examples=300)

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from cvo_edge.errors import SourceError
+from cvo_edge.errors import SourceError, UsageError
 from cvo_edge.input.decoding import decode_image
+from cvo_edge.input.half import halve
 from cvo_edge.input.image_row import ImageRow
 from cvo_edge.input.pieces import Pieces
 from cvo_edge.input.pipes import PipedImages, PipedVideo
@@ -95,6 +96,20 @@ def fed(content):
     os.write(writer, content)
     os.close(writer)
     return standard_input(reader)
+
+
+@pytest.mark.parametrize("kind", ["jpegs", "parts", "pngs", "y4m"])
+def test_jpegs_in_a_row_are_halved_and_nothing_else_is(tmp_path, kind):
+    with piped(tmp_path, CONTENT[kind](tmp_path)) as path:
+        frames = open_source(path)
+        if kind in ("pngs", "y4m"):
+            with pytest.raises(UsageError, match="expected JPEG files, or a pipe of JPEG images"):
+                halve(frames)
+            list(frames)
+            return
+        halve(frames)
+        for frame, image in zip(frames, encoded(".jpg"), strict=True):
+            np.testing.assert_array_equal(frame.image, decode_image(image, decode="half"))
 
 
 @pytest.mark.parametrize("kind", CONTENT)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from cvo_edge import Odometer, UsageError, open_source
+from cvo_edge.input.decoding import decode_image
 from cvo_edge.output.messages import Placement, ros_messages
 from cvo_edge.output.records import header_of
 
@@ -98,6 +99,15 @@ def test_every_encoding_gives_the_image(encoding, padding):
 def test_big_endian_numbers_are_read():
     message = image_message(WIDE.astype(">u2"), "mono16", big=True)
     assert np.array_equal(frame_of(message, 0, NOW_NS).image, GREY)
+
+
+def test_half_a_picture_comes_from_a_jpeg_alone():
+    content = cv2.imencode(".jpg", BGR)[1].tobytes()
+    message = SimpleNamespace(header=header(), format="jpeg", data=array("B", content))
+    image = frame_of(message, 0, NOW_NS, decode="half").image
+    assert np.array_equal(image, decode_image(content, decode="half"))
+    with pytest.raises(UsageError, match="uncompressed image"):
+        frame_of(image_message(BGR, "bgr8"), 0, NOW_NS, decode="half")
 
 
 def test_compressed_images_are_decoded():
