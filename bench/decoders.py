@@ -1,9 +1,10 @@
 """Decoders of JPEG files beside the one in use, whole and at half size: time and equal pixels.
 
-    python bench/decoders.py [--rounds 600]
+    python bench/decoders.py [FOLDER NAME] [--rounds 600]
 
-Fifty files of 640x480 (``python bench/networks.py`` writes them), one thread, one call of each
-decoder in turn. A decoder that is not installed is left out: ``pip install -e ".[peers]"``.
+The first fifty JPEG files of 640x480 in a folder, by default those of ``python bench/networks.py``;
+one thread, one call of each decoder in turn. Writes ``results/decoders/NAME.json``. A decoder that
+is not installed is left out: ``pip install -e ".[peers]"``.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -29,7 +31,7 @@ from cvo_edge.input.preprocess import halved, model_input
 Image = NDArray[np.uint8]
 Decoder = Callable[[bytes], Image]
 
-INPUT = 192, 256
+FILES, INPUT = 50, (192, 256)
 WHOLE, HALF = "cvo-edge", "cvo-edge, half"
 COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -125,10 +127,13 @@ def differences(contents: list[bytes]) -> dict[str, float]:
 def main() -> None:
     """Compare, time and write the result."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, nargs="?", default=WORK / "frames")
+    parser.add_argument("name", nargs="?", default="times")
     parser.add_argument("--rounds", type=int, default=600)
-    rounds = parser.parse_args().rounds
+    arguments = parser.parse_args()
+    rounds = arguments.rounds
     cv2.setNumThreads(1)
-    contents = [path.read_bytes() for path in sorted((WORK / "frames").glob("*.jpg"))]
+    contents = [path.read_bytes() for path in sorted(arguments.folder.glob("*.jpg"))[:FILES]]
     found, releases = decoders()
     results: dict[str, Any] = {}
     calls: dict[str, Callable[[int], object]] = {
@@ -147,7 +152,7 @@ def main() -> None:
             "equal_files": equal_pixels(decode, like, contents),
         }
     write_result(
-        RESULTS / "decoders" / "times.json",
+        RESULTS / "decoders" / f"{arguments.name}.json",
         {
             "settings": {"rounds": rounds, "files": len(contents), "releases": releases},
             "header_ms": figures(spent["header"]),
