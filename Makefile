@@ -68,19 +68,10 @@ docs: $(DOCS_VENV)/.installed ## build the documentation into build/site, strict
 	NO_MKDOCS_2_WARNING=1 $(DOCS_VENV)/bin/mkdocs build --strict --quiet
 	@echo "build/site/index.html"
 
-# One after another: nothing may run during a measurement.
-bench: $(VENV)/.installed ## measure speed, memory and start-up against other engines; one hour on a quiet machine
-	$(VENV)/bin/python bench/networks.py
-	$(VENV)/bin/python bench/frame.py
-	$(VENV)/bin/python bench/stream.py
-	$(VENV)/bin/python bench/stages.py
-	$(VENV)/bin/python bench/four_cameras.py
-	$(VENV)/bin/python bench/start.py
-	$(VENV)/bin/python bench/scaling.py
-	$(VENV)/bin/python bench/peers.py
-	$(VENV)/bin/python bench/decoders.py
-	$(VENV)/bin/python bench/uncertainty_peers.py
-	$(VENV)/bin/python bench/goals.py
+# AGAINST: another checkout of this repository, measured in turns with this one.
+AGAINST ?=
+bench: $(VENV)/.installed ## measure speed, memory and start-up on a quiet machine, within an hour; goes on where it ended (AGAINST: another checkout)
+	$(VENV)/bin/python bench/all.py $(if $(AGAINST),--against $(AGAINST))
 
 # RUNS: run folders to measure instead of the demonstration bundles.
 RUNS ?=

@@ -127,7 +127,7 @@ def differences(contents: list[bytes]) -> dict[str, float]:
 def main() -> None:
     """Compare, time and write the result."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, nargs="?", default=WORK / "frames")
+    parser.add_argument("folder", type=Path, nargs="?", default=WORK / "flights")
     parser.add_argument("name", nargs="?", default="times")
     parser.add_argument("--rounds", type=int, default=600)
     arguments = parser.parse_args()

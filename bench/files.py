@@ -6,7 +6,8 @@ Fifty files of 640x480 (ResNet34 in float32: twenty) go through what ``cvo-edge 
 summary and records in a file, in mode ``latency`` and in mode ``throughput``, and through a
 sequential script on onnxruntime with default settings (``script``). All run in fresh processes that
 take turns, on two cores and on one; with another checkout, its processes take turns, too. ``bmp``
-holds the same pixels without compression. The script writes the pose and what else is small, and
+holds the same pixels without compression. CJP also runs with ``decode: half`` in its bundle
+(``cjp, half``). The script writes the pose and what else is small, and
 solves for the pose of ``scr`` with OpenCV's ``solvePnP``. Ratios are medians within a turn.
 """
 
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from networks import BACKBONES, DEMONSTRATED, PRECISIONS, WORK, frames_as, whole_bundle
+from networks import BACKBONES, DEMONSTRATED, PRECISIONS, WORK, frames_as, half_bundle, whole_bundle
 from rounds import Array, figures, in_turn, ratio, write_report
 from workers import Worker, commit_of
 
@@ -32,7 +33,11 @@ WARM_UP = 1
 # CJP stands for the goals; the others differ in what follows the network.
 ROUNDS = {"cjp": 15}
 OTHER_ROUNDS = 5
+# A bundle of this checkout's newest format, which another one may not read.
+HALF = "cjp, half"
 FILES, SLOW_FILES = 50, 20
+
+METHODS = (*DEMONSTRATED, HALF)
 
 # Bundle, folder, cores, file for records.
 _OURS = """
@@ -164,7 +169,7 @@ def main() -> None:
     """Time all bundles, or those of the methods that are named."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--against", type=Path, help="another checkout, to take turns with")
-    parser.add_argument("--methods", nargs="+", default=DEMONSTRATED, choices=DEMONSTRATED)
+    parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
     parser.add_argument("--rounds", type=int, help="for a quick look, which writes no result")
     arguments = parser.parse_args()
     other = None if arguments.against is None else arguments.against.resolve()
@@ -172,17 +177,20 @@ def main() -> None:
     for method, backbone, precision in product(arguments.methods, BACKBONES, PRECISIONS):
         rounds = arguments.rounds or ROUNDS.get(method, OTHER_ROUNDS)
         slow = (backbone, precision) == ("resnet34", "fp32")
-        bundle = whole_bundle(method, backbone, precision)
-        for form, cores in product(FORMATS, CORES):
+        half = method == HALF
+        bundle = (
+            half_bundle(backbone, precision) if half else whole_bundle(method, backbone, precision)
+        )
+        for form, cores in product(("jpg",) if half else FORMATS, CORES):
             folder = frames_as(form, SLOW_FILES if slow else FILES)
-            found = measured(bundle, folder, cores, rounds, other)
+            found = measured(bundle, folder, cores, rounds, None if half else other)
             row = results.setdefault(backbone, {}).setdefault(method, {}).setdefault(precision, {})
             row[f"{form}, {cores}"] = found
             print(
                 f"{backbone:<16} {method:<5} {precision} {form}, cores {cores}: {line(found)}",
                 flush=True,
             )
-    if arguments.rounds is None and set(arguments.methods) == set(DEMONSTRATED):
+    if arguments.rounds is None and set(arguments.methods) == set(METHODS):
         before = {} if other is None else {"before": commit_of(other)}
         write_report("files", results, rounds=ROUNDS, other_rounds=OTHER_ROUNDS, **before)
 

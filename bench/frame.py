@@ -6,12 +6,14 @@ For every method: whole MobileNetV2 and ResNet34 at 224x224 and the demonstratio
 float32 and 8 bits, on frames of 640x480; CJP also at 240x240, which halving alone produces. Four
 calls are compared in pairs that take turns: onnxruntime on a prepared input (``raw``), array to
 interval (``step``), JPEG file to JSON record in a file (``record``), and array to pose with the
-outputs for intervals removed from the network (``pose_alone``).
+outputs for intervals and for the alarm removed from the network (``pose_alone``; SCR solves for the
+pose, and no more). ``step`` runs all checks and the alarm.
 """
 
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Callable
 from itertools import cycle
 from pathlib import Path
@@ -20,8 +22,8 @@ from typing import Any
 import numpy as np
 from networks import (
     BACKBONES,
+    DEMONSTRATED,
     HALVED,
-    METHODS,
     PRECISIONS,
     WORK,
     demonstration,
@@ -34,14 +36,45 @@ from rounds import Array, figures, interleaved, ratio, write_report
 
 from cvo_edge.engine.loading import Bundle, read_bundle
 from cvo_edge.engine.session import Session
+from cvo_edge.heads.scr import ScrHead
 from cvo_edge.input import preprocess
 from cvo_edge.input.decoding import decode_image
+from cvo_edge.input.view import SeenCamera, crop_view, seen_camera
 from cvo_edge.odometer import Odometer
 from cvo_edge.output.sinks import Sink
+from cvo_edge.pose_solver import PoseSolver
 from cvo_edge.vocabulary import Scope
 
-THREADS, ROUNDS, WARM_UP, BLOCKS = 2, 150, 20, 3
+THREADS, ROUNDS, WARM_UP, BLOCKS = 2, 90, 15, 3
 PAIRS = (("record", "raw"), ("step", "pose_alone"), ("step", "raw"))
+
+
+def seen_by(bundle: Bundle) -> SeenCamera:
+    """Return the camera of a bundle of SCR as its solver sees it."""
+    camera, inputs = bundle.calibration.camera, bundle.calibration.preprocess
+    if camera is None:
+        raise SystemExit("expected a bundle with a camera, found one without")
+    shape = inputs.height, inputs.width, inputs.crop
+    own = crop_view(camera.height, camera.width, *shape).camera(camera)
+    return seen_camera(camera, own, inputs.crop)
+
+
+def solve_alone(bundle: Bundle) -> Callable[[dict[str, np.ndarray]], object]:
+    """Return what finds the pose alone in the outputs of ``pose_alone``'s network."""
+    head = bundle.head
+    if not isinstance(head, ScrHead):
+        return lambda _: None
+    seen, parameters = seen_by(bundle), head.parameters
+    solver = PoseSolver(
+        seen.rays(parameters.grid), np.array(parameters.starts), np.array(parameters.damping)
+    )
+    focal_px = seen.camera.focal_px
+
+    def solve(outputs: dict[str, np.ndarray]) -> object:
+        scales = np.exp(outputs["log_scale_px"][0].astype(float)) / focal_px
+        return solver.solve(outputs["coordinates"][0], scales)
+
+    return solve
 
 
 class Timed:
@@ -53,9 +86,11 @@ class Timed:
 
     def __init__(self, bundle: Bundle, sink: Sink, scope: Scope = "marginal") -> None:
         self.conformal_ms: list[float] = []
+        self._unbounded: Counter[str] = Counter()
         self._spec = bundle.calibration.preprocess
         self._odometer = Odometer(bundle, threads=THREADS, scope=scope)
         self._alone = Session(pose_alone(bundle.model_bytes), THREADS)
+        self._solve = solve_alone(bundle)
         self._sink = sink
         self._pictures, self._files = cycle(images()), cycle(frames())
         self._image = next(self._pictures).copy()
@@ -93,12 +128,16 @@ class Timed:
         if self._odometer.session:
             self._odometer.session.run(self._feeds)
 
-    def step(self, number: int) -> None:
+    def step(self, _: int) -> None:
         """Time one step, from image array to interval."""
         estimate = self._odometer.step(self._image)
-        if not estimate.bounded:
-            raise SystemExit(f"frame {number}: expected finite intervals, found unbounded ones")
         self.conformal_ms.append(estimate.latency_ms["conformal"])
+        self._unbounded.update(estimate.reasons * (not estimate.bounded))
+
+    def check(self, count: int) -> None:
+        """Refuse times of steps without intervals; networks that know little doubt a few frames."""
+        if 2 * self._unbounded.total() > count:
+            raise SystemExit(f"expected intervals, found {dict(self._unbounded)} in {count} frames")
 
     def record(self, _: int) -> None:
         """From a JPEG file to a line in a file."""
@@ -108,7 +147,7 @@ class Timed:
 
     def pose_alone(self, _: int) -> None:
         """From an array to the pose, without the outputs for intervals."""
-        self._alone.run({"image": self._input()})
+        self._solve(self._alone.run({"image": self._input()}))
 
     def _input(self) -> preprocess.Image:
         bgr = preprocess.to_bgr8(self._image)
@@ -134,6 +173,7 @@ def measured(folder: Path, rounds: int, scope: Scope = "marginal") -> dict[str, 
                 two = {name: calls[name] for name in (first, second)}
                 ms = interleaved(two, rounds=rounds // BLOCKS, warmup=WARM_UP, before=before)
                 found[first, second].append((ms[first], ms[second]))
+            timed.check(2 * (WARM_UP + rounds // BLOCKS))
             conformal_ms += timed.conformal_ms[WARM_UP:]
     (record, raw_beside_record), (step_beside_alone, alone), (step, raw) = (
         np.concatenate(blocks, axis=1) for blocks in found.values()
@@ -181,9 +221,9 @@ def line(row: dict[str, Any]) -> str:
 
 def main() -> None:
     """Time all bundles, or those of the methods that are named."""
-    methods = sys.argv[1:] or METHODS
-    if not set(methods) <= set(METHODS):
-        raise SystemExit(f"expected some of {', '.join(METHODS)}, found {', '.join(methods)}")
+    methods = sys.argv[1:] or DEMONSTRATED
+    if not set(methods) <= set(DEMONSTRATED):
+        raise SystemExit(f"expected some of {', '.join(DEMONSTRATED)}, found {', '.join(methods)}")
     results: dict[str, Any] = {}
     for backbone in (*BACKBONES, "demonstration"):
         results[backbone] = {}
@@ -208,7 +248,7 @@ def main() -> None:
         found = measured(whole_bundle("cjp", backbone, size=HALVED), ROUNDS)
         results["halved"][backbone] = found
         print(f"{backbone:<16} {HALVED} {line(found)}", flush=True)
-    if set(methods) == set(METHODS):
+    if set(methods) == set(DEMONSTRATED):
         write_report(
             "frame", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP, blocks=BLOCKS
         )

@@ -21,15 +21,13 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from frame import seen_by, solve_alone
 from networks import PRECISIONS, demonstration, frames, images
 from provenance import write_result
 from rounds import figures, interleaved, ratio
 
 from cvo_edge.engine.loading import read_bundle
-from cvo_edge.heads.scr import ScrHead
-from cvo_edge.input.view import crop_view, seen_camera
 from cvo_edge.odometer import Odometer
-from cvo_edge.pose_solver import PoseSolver
 
 BUNDLES = {
     f"{method} {precision}": demonstration(method, precision)
@@ -76,26 +74,17 @@ def frame_ms(threads: int) -> dict[str, dict[str, Any]]:
 def solver_figures() -> tuple[dict[str, float], dict[str, int]]:
     """Time the solver on outputs of the network, and count its calls for one frame."""
     bundle = read_bundle(BUNDLES["scr fp32"])
-    calibration, head = bundle.calibration, bundle.head
-    camera, inputs = calibration.camera, calibration.preprocess
-    if not isinstance(head, ScrHead) or camera is None:
-        raise SystemExit("expected a bundle of scr, found another one")
-    shape = inputs.height, inputs.width, inputs.crop
-    own = crop_view(camera.height, camera.width, *shape).camera(camera)
-    seen = seen_camera(camera, own, inputs.crop)
+    head, seen, alone = bundle.head, seen_by(bundle), solve_alone(bundle)
     whole = head.solver(seen)
-    parameters = head.parameters
-    alone = PoseSolver(
-        seen.rays(parameters.grid), np.array(parameters.starts), np.array(parameters.damping)
-    )
+    if whole is None:
+        raise SystemExit("expected a bundle of scr, found another one")
     with Odometer(bundle, threads=1) as odometer:
         outputs = [dict(odometer.observe(picture, 0).outputs) for picture in images()]
-    scales = [np.exp(each["log_scale_px"][0].astype(float)) / own.focal_px for each in outputs]
     spent: dict[str, list[float]] = {"solve": [], "solver": []}
     for number in range(CALLS):
         each = number % len(outputs)
         begin = perf_counter()
-        alone.solve(outputs[each]["coordinates"][0], scales[each])
+        alone(outputs[each])
         middle = perf_counter()
         whole(outputs[each])
         spent["solve"].append(1e3 * (middle - begin))

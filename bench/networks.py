@@ -33,14 +33,15 @@ DEMONSTRATED = ("scr", *METHODS)
 BACKBONES = ("mobilenetv2_100", "resnet34")
 PRECISIONS = ("fp32", "int8")
 ROOM = "synthetic:room,flights=20,frames=20"
-FRAMES = "synthetic:room,flights=1,frames=50,size=640x480,seed=1"
+# Longer than the memory of the checks of repetition, which would doubt a picture that comes again.
+FRAMES = "synthetic:room,flights=7,frames=50,size=640x480,seed=1"
 _CROP = "--crop centre"
 _WHOLE = "--stages final --grid 1x1"
 # A cropped frame of 640x480, halved.
 HALVED = "240x240"
 _UNTRAINED = "--split random --steps 100 --copies 0"
 # Cells must agree on a pose, or none of its frames has an interval.
-_CELLS = "--cell-steps 40"
+_CELLS = "--cell-steps 600 --upper-rate 0.1"
 
 
 def whole_bundle(
@@ -54,7 +55,7 @@ def whole_bundle(
     name = f"{method}-{backbone}" if size == "224x224" else f"{method}-{backbone}-{size}"
     part = _CELLS if method == "scr" else _WHOLE
     options = f"--backbone {backbone} {part} {_CROP} --size {size}"
-    options = f"{options} --weights {_random_weights(backbone)}"
+    options = f"{options} --weights {_random_weights(backbone, calm=method == 'scr')}"
     run, bundle = WORK / "runs" / name, WORK / f"{name}-{precision}"
     if provider != "onnxruntime":
         bundle = bundle.with_name(f"{bundle.name}-{provider}")
@@ -67,9 +68,37 @@ def whole_bundle(
     return bundle
 
 
-def _random_weights(backbone: str) -> Path:
-    """Return the file of a backbone's random weights, made if it does not exist."""
-    path = WORK / f"{backbone}-random.safetensors"
+def half_bundle(backbone: str, precision: str) -> Path:
+    """Return CJP's bundle for JPEG files that are decoded at half size, made if it is missing."""
+    bundle = WORK / f"cjp-{backbone}-{precision}-half"
+    if not bundle.exists():
+        whole = whole_bundle("cjp", backbone, precision)
+        _cvo_export("calibrate", str(whole), f"7scenes:{_room()}", str(bundle), "--decode", "half")
+    return bundle
+
+
+def _room() -> Path:
+    """Return the room's recordings as JPEG files of 640x480 with poses, in 7-Scenes' layout."""
+    room = WORK / "room"
+    if not room.exists():
+        from cvo_export.datasets import open_dataset
+        from cvo_export.datasets.seven_scenes import write_sequence
+
+        partial = WORK / "room.partial"
+        shutil.rmtree(partial, ignore_errors=True)
+        dataset = open_dataset(f"{ROOM},size=640x480")
+        for sequence in range(len(dataset.sequence_names)):
+            write_sequence(dataset, sequence, partial / f"seq-{sequence + 1:02}", None)
+        partial.rename(room)
+    return room
+
+
+def _random_weights(backbone: str, *, calm: bool) -> Path:
+    """Return the file of a backbone's random weights, made if it does not exist.
+
+    Those that can be trained in few steps are ``calm``: their residual branches add little.
+    """
+    path = WORK / f"{backbone}-{'calm' if calm else 'random'}.safetensors"
     if not path.exists():
         import timm
         import torch
@@ -78,20 +107,20 @@ def _random_weights(backbone: str) -> Path:
         WORK.mkdir(parents=True, exist_ok=True)
         torch.manual_seed(0)
         body = timm.create_model(backbone, pretrained=False, num_classes=0)
-        open_branches(body)
+        open_branches(body, 0.2 if calm else 1.0)
         save_file(body.state_dict(), path)
     return path
 
 
-def open_branches(body: nn.Module) -> None:
-    """Replace the scales of zero with which residual branches start by ones.
+def open_branches(body: nn.Module, scale: float = 1.0) -> None:
+    """Replace the scales of zero with which residual branches start.
 
     Otherwise an engine that folds constants drops these branches and is timed on a fraction of
     ResNet34, and 8 bits have nothing to round.
     """
     for name, values in body.named_parameters():
         if name.endswith("weight") and not values.any():
-            values.data.fill_(1.0)
+            values.data.fill_(scale)
 
 
 def demonstration(method: str, precision: str = "fp32") -> Path:
@@ -100,15 +129,15 @@ def demonstration(method: str, precision: str = "fp32") -> Path:
 
 
 def frames() -> list[Path]:
-    """Return fifty JPEG files, 640x480, of a flight through the room; rendered once."""
-    folder = WORK / "frames"
+    """Return 350 JPEG files, 640x480, of flights through the room; rendered once."""
+    folder = WORK / "flights"
     if not folder.exists():
         from cvo_export.datasets import open_dataset
 
-        partial = WORK / "frames.partial"
+        partial = WORK / "flights.partial"
         partial.mkdir(parents=True, exist_ok=True)
         dataset = open_dataset(FRAMES)
-        for index in range(50):
+        for index in range(len(dataset)):
             cv2.imwrite(str(partial / f"frame-{index:06}.jpg"), dataset.read_image(index))
         partial.rename(folder)
     return sorted(folder.glob("*.jpg"))
@@ -135,9 +164,11 @@ def images() -> list[np.ndarray]:
 
 
 def pose_alone(model_bytes: bytes) -> bytes:
-    """Return the part of a model that computes the pose."""
-    extractor = Extractor(onnx.load_from_string(model_bytes))
-    part: bytes = extractor.extract_model(["image"], ["pose"]).SerializeToString()
+    """Return the part of a model that computes the pose, or what a solver needs for it."""
+    model = onnx.load_from_string(model_bytes)
+    solved = {"coordinates", "log_scale_px"} & {output.name for output in model.graph.output}
+    outputs = sorted(solved) or ["pose"]
+    part: bytes = Extractor(model).extract_model(["image"], outputs).SerializeToString()
     return part
 
 
@@ -153,6 +184,8 @@ def main() -> None:
         print(whole_bundle(method, backbone, precision).name, flush=True)
     for backbone in BACKBONES:
         print(whole_bundle("cjp", backbone, size=HALVED).name, flush=True)
+        for precision in PRECISIONS:
+            print(half_bundle(backbone, precision).name, flush=True)
 
 
 if __name__ == "__main__":

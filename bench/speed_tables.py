@@ -67,19 +67,38 @@ def precision(results: dict[str, Any]) -> Rows:
         yield [label, *(two(results[name][m]["fp32_over_int8"]) for m in methods)]
 
 
-def throughput(results: dict[str, Any]) -> Rows:
-    """JPEG files to records."""
+def files(results: dict[str, Any]) -> Rows:
+    """Files to records over the script's time."""
     yield [
-        "network",
-        "files to records",
-        "ms per frame",
-        "frames per second",
-        "naive script / this",
+        *("network", "method", "", "script, ms", "`latency`", "`throughput`", "default"),
+        *("default before", "one core: `latency`", "default", "BMP: default", "on one core"),
     ]
     for name in BACKBONES:
-        for what, row in results[name]["throughput"].items():
-            cells = [two(row["ms_per_frame"]), number(row["frames_per_second"], 0)]
-            yield [SHORT[name], what, *cells, two(row["naive_over_this"])]
+        for method, rows in results[name].items():
+            for kind, found in rows.items():
+                two_cores, one_core = found["jpg, 2"], found["jpg, 1"]
+                # One bundle is for JPEG files alone.
+                plain = [found.get(f"bmp, {cores}", {}) for cores in (2, 1)]
+                cells = [
+                    *(_over(two_cores, mode) for mode in ("latency", "throughput", "default")),
+                    _over(two_cores, "before, default"),
+                    *(_over(one_core, mode) for mode in ("latency", "default")),
+                    *(_over(row, "default") for row in plain),
+                ]
+                yield [SHORT[name], method, kind, two(two_cores["script"]["ms"]), *cells]
+
+
+def _over(found: dict[str, Any], call: str) -> str:
+    return number(found[call]["over_script"]["median"]) if call in found else "-"
+
+
+def first_record(results: dict[str, Any]) -> Rows:
+    """Start of `run` to its first record."""
+    yield ["network", "", "`latency`, ms", "`throughput`, ms", "`throughput` / `latency`"]
+    for name in BACKBONES:
+        for kind, row in results[name]["first_record"].items():
+            cells = [two(row["latency_ms"], 0), two(row["throughput_ms"], 0)]
+            yield [SHORT[name], kind, *cells, two(row["throughput_over_latency"], 3)]
 
 
 def camera(results: dict[str, Any]) -> Rows:
@@ -244,15 +263,25 @@ def instructions(counts: list[dict[str, Any]]) -> Rows:
 
 def against(results: dict[str, Any]) -> Rows:
     """Array to interval of two checkouts."""
-    other = "of the other checkout"
-    yield ["method", "/ raw call", other, "- raw call, ms", other]
-    for method, found in results.items():
-        both = (found["this"], found["other"])
-        yield [
-            method,
-            *(number(one["ratio_to_raw"], 3) for one in both),
-            *(number(one["around_the_network_ms"]) for one in both),
-        ]
+    yield [
+        *("network", "method", "", "/ raw call: before", "now", "- raw call, ms: before", "now"),
+        *("p10 now", "one core: before", "now", "frame now / before"),
+    ]
+    for name in BACKBONES:
+        for method, rows in results[name].items():
+            for kind, found in rows.items():
+                before, now = found["2"]["before"], found["2"]["now"]
+                cells = [
+                    *(number(row["step_over_raw"]["median"], 3) for row in (before, now)),
+                    *(number(row["step_minus_raw_ms"]["median"]) for row in (before, now)),
+                    number(now["step_minus_raw_ms"]["p10"]),
+                    *(
+                        number(found["1"][each]["step_minus_raw_ms"]["median"])
+                        for each in ("before", "now")
+                    ),
+                    number(found["2"]["step_now_over_before"]["median"], 3),
+                ]
+                yield [SHORT[name], method, kind, *cells]
 
 
 def stages(results: dict[str, Any]) -> Rows:
@@ -268,8 +297,9 @@ def stages(results: dict[str, Any]) -> Rows:
 # Program -> the tables of its results.
 _TABLES: dict[str, tuple[Callable[[dict[str, Any]], Rows], ...]] = {
     "frame": (frame, precision),
-    "stream": (throughput, camera, neighbour),
-    "start": (load, process),
+    "files": (files,),
+    "stream": (camera, neighbour),
+    "start": (load, process, first_record),
     "peers": (peers,),
     "uncertainty_peers": (uncertainty,),
     "scaling": (scaling, confidences),

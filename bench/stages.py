@@ -11,7 +11,7 @@ from __future__ import annotations
 from statistics import median
 from typing import Any
 
-from networks import DEMONSTRATED, WORK, demonstration, frames, whole_bundle
+from networks import DEMONSTRATED, demonstration, frames, whole_bundle
 from rounds import write_report
 
 from cvo_edge.programs.bench import benchmark
@@ -22,7 +22,7 @@ BACKBONE = "mobilenetv2_100"
 
 def main() -> None:
     """Measure all, print the time around the engine, and write the result file."""
-    frames()
+    folder = frames()[0].parent
     bundles = {method: demonstration(method) for method in DEMONSTRATED}
     for precision in ("fp32", "int8"):
         bundles[f"cjp, whole, {precision}"] = whole_bundle("cjp", BACKBONE, precision)
@@ -31,7 +31,7 @@ def main() -> None:
         for name, bundle in bundles.items():
             report = benchmark(
                 bundle,
-                str(WORK / "frames"),
+                str(folder),
                 frames=FRAMES,
                 warmup=WARM_UP,
                 threads=THREADS,

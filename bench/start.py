@@ -5,8 +5,9 @@
 Every figure comes from fresh processes that take turns: onnxruntime with default settings on the
 float32 model, with two threads and with one (a second thread spins); and ``Odometer.load`` with a
 warm model cache in both precisions. Then whole processes: the smallest script of onnxruntime and
-OpenCV that prints the pose of one JPEG file, and ``cvo-edge run`` on the same file. Modules are
-compiled beforehand, as an installation does.
+OpenCV that prints the pose of one JPEG file, and ``cvo-edge run`` on the same file; and the time
+from the start of ``cvo-edge run`` on fifty files to its first record, by mode. Modules are compiled
+beforehand, as an installation does.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 from typing import Any
 
 import numpy as np
-from networks import BACKBONES, WORK, frames, whole_bundle
+from networks import BACKBONES, PRECISIONS, WORK, frames, frames_as, whole_bundle
 from rounds import Array, figures, in_turn, interleaved, ratio, write_report
 
 METHOD, THREADS, ROUNDS, WARM_UP = "cjp", 2, 15, 2
@@ -105,20 +107,55 @@ def first_interval(backbone: str) -> dict[str, Any]:
     }
 
 
+def first_record(backbone: str) -> dict[str, Any]:
+    """Milliseconds from the start of ``run`` on a folder to its first record, by mode."""
+    folder = str(frames_as("jpg"))
+    found: dict[str, Any] = {}
+    for precision in PRECISIONS:
+        bundle = str(whole_bundle(METHOD, backbone, precision))
+        calls = {
+            mode: partial(_first_line, [RUN, "run", bundle, folder, "--quiet", "--mode", mode])
+            for mode in ("latency", "throughput")
+        }
+        spent = interleaved(calls, rounds=ROUNDS, warmup=WARM_UP)
+        found[precision] = {
+            **{f"{mode}_ms": figures(ms) for mode, ms in spent.items()},
+            "throughput_over_latency": ratio(spent["throughput"], spent["latency"]),
+        }
+    return found
+
+
+def _first_line(arguments: list[str], _: int) -> None:
+    command = [sys.executable, "-c", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=_environment()) as process:
+        # The header and the first record.
+        if process.stdout is None or not (process.stdout.readline() and process.stdout.readline()):
+            raise SystemExit("expected a record, found none")
+        process.kill()
+
+
 def _run(arguments: list[str]) -> str:
+    command = [sys.executable, "-c", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=_environment())
+    return done.stdout
+
+
+def _environment() -> dict[str, str]:
     environment = {**os.environ, "CVO_EDGE_CACHE": str(WORK / "cache")}
     # If it is set, every process compiles all modules of a checkout again.
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    command = [sys.executable, "-c", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    return done.stdout
+    return environment
 
 
 def main() -> None:
     """Measure both backbones."""
     results: dict[str, Any] = {}
     for backbone in BACKBONES:
-        results[backbone] = {"load": loaded(backbone), "process": first_interval(backbone)}
+        results[backbone] = {
+            "load": loaded(backbone),
+            "process": first_interval(backbone),
+            "first_record": first_record(backbone),
+        }
         for name, row in results[backbone]["load"].items():
             load, memory = row["load_ms"], row["anonymous_mib"]
             print(
@@ -134,6 +171,14 @@ def main() -> None:
             f"({process['over_script']['median']:.3f})",
             flush=True,
         )
+        for precision, row in results[backbone]["first_record"].items():
+            print(
+                f"{backbone:<16} first record of fifty, {precision}: latency "
+                f"{row['latency_ms']['median']:.0f} ms, throughput "
+                f"{row['throughput_ms']['median']:.0f} ms "
+                f"({row['throughput_over_latency']['median']:.3f})",
+                flush=True,
+            )
     write_report("start", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP, method=METHOD)
 
 

@@ -1,16 +1,13 @@
-"""A stream of frames: throughput, and the processor time of a steady camera.
+"""A steady camera: processor time; and steps beside a busy process.
 
     python bench/stream.py
 
-Throughput: JPEG files to JSON records, by a sequential script on onnxruntime with default settings
-(``naive``) and by ``Odometer.stream`` in each mode and precision, in turns. Camera: 30 frames
-per second; processor time per frame of onnxruntime with default settings (the model alone, on a
-prepared input) and of mode ``live``.
+Camera: 30 frames per second; processor time per frame of onnxruntime with default settings (the
+model alone, on a prepared input) and of mode ``live``. ``bench/files.py`` measures files.
 """
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import time
@@ -22,20 +19,16 @@ from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
-import cv2
 import numpy as np
 import onnxruntime
-from networks import BACKBONES, WORK, frames, images, whole_bundle
+from networks import BACKBONES, images, whole_bundle
 from rounds import figures, in_turn, interleaved, ratio, write_report
 
 from cvo_edge.engine.loading import read_bundle
 from cvo_edge.input.frame import Frame
-from cvo_edge.input.sources import open_source
 from cvo_edge.odometer import Odometer
-from cvo_edge.output.sinks import Sink
 
 METHOD, THREADS = "cjp", 2
-ROUNDS, WARM_UP = 15, 2
 FPS, SECONDS, CAMERA_ROUNDS = 30, 3, 5
 STEPS = 200
 BUSY = "while True: pass"
@@ -48,30 +41,6 @@ def default_session(bundle: Path, threads: int) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(
         (bundle / "model.onnx").read_bytes(), options, providers=["CPUExecutionProvider"]
     )
-
-
-def naive(engine: onnxruntime.InferenceSession, target: Path) -> Callable[[int], object]:
-    """Return a sequential loop: read, resize, infer, write."""
-
-    def run(_: int) -> None:
-        with target.open("w") as stream:
-            for path in frames():
-                image = cv2.resize(cv2.imread(str(path)), (224, 224))
-                image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-                outputs = engine.run(None, {"image": image[np.newaxis]})
-                stream.write(json.dumps([values.tolist() for values in outputs]) + "\n")
-
-    return run
-
-
-def streamed(odometer: Odometer, sink: Sink) -> Callable[[int], object]:
-    """Return what ``cvo-edge run`` does with the files."""
-
-    def run(_: int) -> None:
-        for estimate in odometer.stream(open_source(str(WORK / "frames"))):
-            sink.write(estimate)
-
-    return run
 
 
 class Recording:
@@ -92,33 +61,6 @@ class Recording:
         """Yield calls that return frames."""
         for frame in self:
             yield lambda frame=frame: frame
-
-
-def throughput(backbone: str) -> dict[str, Any]:
-    """Time the whole folder, in turns; ratios are the naive float32 script over each."""
-    with ExitStack() as stack:
-        sink = stack.enter_context(Sink(str(WORK / "records.jsonl"), "jsonl"))
-        plain = whole_bundle(METHOD, backbone)
-        eight = whole_bundle(METHOD, backbone, "int8")
-        calls = {
-            "naive": naive(default_session(plain, THREADS), WORK / "naive.jsonl"),
-            "naive int8": naive(default_session(eight, THREADS), WORK / "naive.jsonl"),
-        }
-        for precision in ("fp32", "int8"):
-            for mode in ("latency", "throughput"):
-                bundle = read_bundle(whole_bundle(METHOD, backbone, precision))
-                odometer = stack.enter_context(Odometer(bundle, threads=THREADS, mode=mode))
-                calls[f"{mode} {precision}"] = streamed(odometer, sink)
-        spent = interleaved(calls, rounds=ROUNDS, warmup=WARM_UP)
-    count = len(frames())
-    return {
-        name: {
-            "ms_per_frame": figures(values / count),
-            "frames_per_second": round(1e3 * count / float(np.median(values)), 1),
-            "naive_over_this": ratio(spent["naive"], values),
-        }
-        for name, values in spent.items()
-    }
 
 
 def camera(backbone: str) -> dict[str, Any]:
@@ -203,16 +145,9 @@ def main() -> None:
     results: dict[str, Any] = {}
     for backbone in BACKBONES:
         results[backbone] = {
-            "throughput": throughput(backbone),
             "camera": camera(backbone),
             "neighbour": neighbour(backbone),
         }
-        for name, row in results[backbone]["throughput"].items():
-            print(
-                f"{backbone:<16} {name:<17} {row['ms_per_frame']['median']:7.2f} ms per frame, "
-                f"{row['naive_over_this']['median']:.2f} times the naive script",
-                flush=True,
-            )
         for name, row in results[backbone]["camera"].items():
             print(
                 f"{backbone:<16} {name:<17} {row['cpu_ms_per_frame']['median']:7.2f} CPU-ms per "
@@ -223,7 +158,13 @@ def main() -> None:
             line = ", ".join(f"{call}: {row['median']:.2f}" for call, row in rows.items())
             print(f"{backbone:<16} {name:<17} ms per step, mode and threads: {line}", flush=True)
     write_report(
-        "stream", results, threads=THREADS, rounds=ROUNDS, warmup=WARM_UP, fps=FPS, method=METHOD
+        "stream",
+        results,
+        threads=THREADS,
+        rounds=CAMERA_ROUNDS,
+        steps=STEPS,
+        fps=FPS,
+        method=METHOD,
     )
 
 

@@ -33,6 +33,7 @@ import speed_tables
 import study_tables
 import vigilance_tables
 from goals import goals_table
+from instead_table import instead_table
 from provenance import ROOT
 from results_index import results_index
 
@@ -68,6 +69,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **service_tables.TABLES,
     "faults": faults,
     "goals": goals_table,
+    "instead": instead_table,
     "results": results_index,
 }
 

@@ -74,10 +74,11 @@ def usual_mode(frames: Source, *, adapts: bool) -> Mode:
 
     Several frames at once start before the labels of the first of them can count, and are given
     when later ones have come: not for an odometer that adapts, nor for frames that are waited for.
+    A single frame has all cores for itself.
     """
     if frames.live:
         return "live"
-    return "latency" if adapts or frames.length is None else "throughput"
+    return "latency" if adapts or frames.length in (None, 1) else "throughput"
 
 
 def run_stream(

@@ -159,7 +159,7 @@ ModeOption = Annotated[
         metavar="<mode>",
         help="live: newest frame, least processor time; latency: every frame, each as fast as "
         "possible; throughput: most frames per second. Default: live for a camera, throughput for "
-        "a recording, latency for one that has no end yet or comes with labels.",
+        "a recording, latency for one that has no end yet, comes with labels or is one image.",
         show_default=False,
         rich_help_panel=RUNTIME,
     ),

@@ -232,6 +232,7 @@ def test_a_process_exits_cleanly_while_a_video_is_being_read(bundle_dir, clip_di
         (False, 50, False, "throughput"),
         (False, 50, True, "latency"),
         (False, None, False, "latency"),
+        (False, 1, False, "latency"),
     ],
 )
 def test_recordings_are_read_as_fast_as_nothing_is_lost(live, length, adapts, mode):
