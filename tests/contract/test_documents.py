@@ -16,6 +16,7 @@ def test_every_program_has_its_results_and_no_figure_is_left_open() -> None:
     found = {path.stem for path in (ROOT / "bench" / "results" / "speed").glob("*.json")}
     programs = [
         "against",
+        "files",
         "frame",
         "peers",
         "scaling",
