@@ -107,7 +107,7 @@ def test_a_graph_that_disagrees_is_refused(tiny_run, monkeypatch):
 
     monkeypatch.setattr(familiarise, "with_familiarity", Wrong())
     with pytest.raises(GateError, match="agree with its formula"):
-        _export(tiny_run, tiny_run.graph.head, tiny_run.training_frames, "fp32")
+        _export(tiny_run, tiny_run.graph.head, tiny_run.training_frames, "fp32", "onnxruntime")
 
 
 def test_colour_numbers_are_means_of_quarters_and_covariances():
