@@ -44,7 +44,7 @@ OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def regular_file(
-    path: Path, limit: int, error: type[CvoError], *, links: bool = False
+    path: Path | str, limit: int, error: type[CvoError], *, links: bool = False
 ) -> io.BufferedReader:
     """Open a regular file of at most ``limit`` bytes; raises ``error`` for anything else.
 
@@ -75,7 +75,7 @@ def regular_file(
 
 
 def read_regular_file(
-    path: Path, limit: int, error: type[CvoError], *, links: bool = False
+    path: Path | str, limit: int, error: type[CvoError], *, links: bool = False
 ) -> bytes:
     """Return all bytes of a regular file; parameters and errors as for ``regular_file``."""
     with regular_file(path, limit, error, links=links) as stream:

@@ -119,12 +119,12 @@ def read_image_file(
     """Read and decode one image file; a frame without an image if that fails."""
     start = perf_counter()
     try:
-        content = read_regular_file(Path(path), MAX_IMAGE_BYTES, SourceError, links=True)
+        content = read_regular_file(path, MAX_IMAGE_BYTES, SourceError, links=True)
         image = decode_image(content, bits, decode)
     except SourceError:
         image = None
     spent = 1e3 * (perf_counter() - start)
-    return Frame(image, stamp_ns, shown(Path(path).name), spent)
+    return Frame(image, stamp_ns, shown(os.path.basename(path)), spent)  # noqa: PTH119
 
 
 def images_in(folder: Path) -> Listing:
