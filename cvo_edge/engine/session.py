@@ -223,7 +223,7 @@ class Session:
     def _call(self, feeds: Mapping[str, NDArray[np.generic]]) -> Sequence[Any]:
         """Input arrays by name -> output arrays in the order of ``outputs``."""
         if not self.caller_core:
-            return self.engine.run(None, feeds)  # type: ignore[no-any-return]
+            return self.engine.run(self._names, feeds)  # type: ignore[no-any-return]
         # The calling thread runs on the one core that no inference thread is pinned to, unless its
         # owner has given it others since the model was loaded.
         pinned = os.sched_getaffinity(0) == self._cores
@@ -234,7 +234,7 @@ class Session:
                 # This process may no longer use that core.
                 pinned, self.caller_core = False, frozenset()
         try:
-            return self.engine.run(None, feeds)  # type: ignore[no-any-return]
+            return self.engine.run(self._names, feeds)  # type: ignore[no-any-return]
         finally:
             # Nor is a change undone that was made during the call.
             if pinned and os.sched_getaffinity(0) == self.caller_core:

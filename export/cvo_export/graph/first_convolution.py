@@ -89,6 +89,7 @@ def read_blocks(model: ModelProto, convolution: NodeProto) -> None:
     shape = np.array([1, plan.rows, plan.columns, len(kernel)])
     by_pixel = nodes("Reshape", by_pixel, nodes.constant(shape))
     nodes.name(nodes("Transpose", by_pixel, perm=[0, 3, 1, 2]), result)
+    _forget_shapes(model, (*transpose.output, *convolution.input, *convolution.output))
     after = list(graph.node).index(quantise) + 1
     _insert(model, graph.node[after], nodes.taken())
     graph.initializer.extend(nodes.constants)
@@ -133,6 +134,13 @@ def _in_blocks(kernel: NDArray[Any], plan: _Plan) -> NDArray[Any]:
         begin = plan.skipped + number * plan.apart
         wide[number, :, :, begin : begin + by_byte.shape[2]] = by_byte
     return wide.reshape(-1, tall, plan.kernel, _BLOCK).transpose(0, 3, 1, 2)
+
+
+def _forget_shapes(model: ModelProto, names: tuple[str, ...]) -> None:
+    """Remove what the graph states of results that now have another shape."""
+    kept = [value for value in model.graph.value_info if value.name not in names]
+    del model.graph.value_info[:]
+    model.graph.value_info.extend(kept)
 
 
 def _insert(model: ModelProto, before: NodeProto, nodes: list[NodeProto]) -> None:
