@@ -34,6 +34,7 @@ from cvo_edge.engine.session import Session
 from cvo_edge.heads.scr import ScrParameters
 from cvo_edge.pose import Chart
 from cvo_edge.pose_solver import PoseSolver
+from cvo_edge.vocabulary import SplitKind
 from cvo_export.data.splits import make_split
 from cvo_export.datasets import open_dataset
 from cvo_export.graph.quantise import quantised
@@ -48,7 +49,11 @@ from cvo_export.training.run import PoseGraph, Run, TrainConfig, load_run
 
 Array = NDArray[np.float64]
 
-FLIGHTS = "7scenes:$CVO_DATA/kitchen_flights"
+# Recordings and their split: new flights, and frames between known ones.
+DATA: dict[str, tuple[str, SplitKind]] = {
+    "flights": ("7scenes:$CVO_DATA/kitchen_flights", "sequence"),
+    "walk": ("7scenes:$CVO_DATA/redkitchen", "random"),
+}
 PRETRAINED = "$CVO_WEIGHTS/mobilenetv2_100_imagenet.safetensors"
 PRECISIONS = ("fp32", "int8")
 # Those whose features are computed in one pass.
@@ -73,12 +78,14 @@ class Candidate:
     size: str
     stages: str = "16"
     kept: int = 100
+    data: str = "flights"
 
     @property
     def name(self) -> str:
         """File name."""
         pruned = "" if self.kept == 100 else f"-kept{self.kept}"
-        return f"{self.method}-{self.size}-{self.stages}{pruned}"
+        data = "" if self.data == "flights" else f"-{self.data}"
+        return f"{self.method}-{self.size}-{self.stages}{pruned}{data}"
 
     @property
     def backbone(self) -> str:
@@ -94,6 +101,7 @@ CANDIDATES = (
     ),
     *(Candidate("cjp", "256x192", kept=kept) for kept in (75, 50)),
     Candidate("cjp", "256x192", "32"),
+    *(Candidate("cjp", size, data="walk") for size in ("256x192", "160x120", "192x144")),
 )
 
 
@@ -104,10 +112,11 @@ def config_of(candidate: Candidate, seed: int, work: Path) -> TrainConfig:
         weights = pruned_weights(
             weights, candidate.kept, work / f"{candidate.backbone}.safetensors"
         )
+    dataset, split = DATA[candidate.data]
     return configure(
         method=candidate.method,
-        dataset=os.path.expandvars(FLIGHTS),
-        split="sequence",
+        dataset=os.path.expandvars(dataset),
+        split=split,
         seed=seed,
         size=candidate.size,
         crop="none",
@@ -135,7 +144,7 @@ def share_features(config: TrainConfig, cache: Path) -> None:
         folders.append(shared_folder(cache, one, sha256, images))
     if all((folder / f"copy-{config.copies:03d}.npz").exists() for folder in folders):
         return
-    whole = cache / f"together-{config.width}x{config.height}-{config.seed}"
+    whole = cache / f"together-{images.digest()[:24]}-{config.seed}"
     extractor = FeatureExtractor(together, *size)
     with show_progress() as progress:
         features, poses = cached_copies(

@@ -12,6 +12,7 @@ from provenance import ROOT, read_result
 mpl.use("agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 PICTURE = ROOT / "docs" / "pictures" / "pareto.png"
 # A palette for colour-blind readers (Okabe and Ito 2008), as in the pictures of studies.
@@ -20,7 +21,8 @@ COLOURS = dict(zip(METHODS, ("#0072B2", "#D55E00"), strict=True))
 
 def draw() -> None:
     """Draw score against milliseconds on two threads and on one."""
-    some = [p for p in points(read_result("pareto", "pareto")) if p.score is not None]
+    every = points(read_result("pareto", "pareto"))
+    some = [p for p in every if p.score is not None and p.data == "flights"]
     figure, panels = plt.subplots(1, 2, figsize=(10, 4.2), sharey=True, layout="constrained")
     for panel, threads in zip(panels, THREADS, strict=True):
         for method, colour in COLOURS.items():
@@ -29,6 +31,9 @@ def draw() -> None:
                 _draw_method(panel, own, threads, colour)
         panel.set_xscale("log")
         panel.set_xlabel(f"ms from array to pose, {threads} thread{'s' if threads == '2' else ''}")
+        panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+        panel.xaxis.set_major_formatter(ScalarFormatter())
+        panel.xaxis.set_minor_formatter(NullFormatter())
         panel.grid(alpha=0.3, which="both")
     panels[0].set_ylabel("interval score at 0.9 on new flights")
     panels[1].legend(fontsize=8)
@@ -57,7 +62,7 @@ def _draw_method(panel: Axes, own: list[Point], threads: str, colour: str) -> No
         f"{at.label}, {at.precision}",
         place,
         textcoords="offset points",
-        xytext=(10, 8),
+        xytext=(10, -14),
         fontsize=8,
     )
 

@@ -6,6 +6,7 @@ python bench/pareto_tables.py    # draw docs/pictures/pareto.png
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,19 +22,19 @@ METHODS = ("cjp", "scr")
 
 
 class Point(NamedTuple):
-    """A network in one precision; milliseconds of a frame by threads.
+    """A network in one precision; milliseconds (p10) of a frame by threads.
 
     ``score`` is the mean over seeds; ``lost`` what it is more than the default's in float32, and
     the standard error of that over the test recordings. Both are None without training.
     """
 
     method: str
+    data: str
     label: str
     precision: str
     score: float | None
     lost: tuple[float, float] | None
     frame: dict[str, float]
-    over_default: dict[str, float]
     default: bool
 
 
@@ -41,7 +42,7 @@ def points(found: dict[str, Any]) -> list[Point]:
     """Return all networks."""
     made = []
     for row in found["networks"].values():
-        wanted = {"method": row["method"], **DEFAULT}
+        wanted = {"method": row["method"], "data": row["data"], **DEFAULT}
         reference = next(r for r in found["networks"].values() if wanted.items() <= r.items())
         for precision in PRECISIONS:
             one = row[precision]
@@ -52,12 +53,12 @@ def points(found: dict[str, Any]) -> list[Point]:
             made.append(
                 Point(
                     row["method"],
+                    row["data"],
                     _label(row),
                     precision,
                     float(np.mean(scores)) if scores else None,
                     _mean_and_error(np.concatenate(lost)) if lost else None,
-                    {t: one["threads"][t]["frame"]["median"] for t in THREADS},
-                    {t: one["threads"][t]["over_default"]["median"] for t in THREADS},
+                    {t: one["threads"][t]["frame"]["p10"] for t in THREADS},
                     wanted.items() <= row.items(),
                 )
             )
@@ -65,6 +66,8 @@ def points(found: dict[str, Any]) -> list[Point]:
 
 
 def _mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
+    if values.size == 1:
+        return float(values[0]), 0.0
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(values.size))
 
 
@@ -94,9 +97,11 @@ def knee(some: list[Point], threads: str) -> Point:
     return min(equal, key=lambda point: point.frame[threads])
 
 
-def scores() -> str:
-    """Return the table of networks."""
-    some = points(read_result("pareto", "pareto"))
+def scores(data: str) -> str:
+    """Return the table of the networks on one kind of data."""
+    every = points(read_result("pareto", "pareto"))
+    some = [point for point in every if point.data == data]
+    default = next(p for p in some if p.default and p.method == "cjp" and p.precision == "fp32")
     fronts = {
         (method, threads): front([p for p in some if p.method == method], threads)
         for method in METHODS
@@ -111,21 +116,25 @@ def scores() -> str:
                 point.label + (" (default)" if point.default else ""),
                 point.precision,
                 "-" if point.score is None else f"{point.score:.3f}",
-                "-"
-                if not (point.lost and point.lost[1])
-                else "{:+.3f} ± {:.3f}".format(*point.lost),
+                _difference(point),
                 *(f"{point.frame[t]:.2f}" for t in THREADS),
-                *(f"{point.over_default[t]:.2f}" for t in THREADS),
+                *(f"{point.frame[t] / default.frame[t]:.2f}" for t in THREADS),
                 " and ".join(on) or "-",
             ]
 
     head = [
-        *("method", "network", "", "score", "less that of the default in fp32"),
-        *(f"{t} threads, ms" if t == "2" else "1 thread, ms" for t in THREADS),
-        *(f"/ CJP's default, {t}" for t in THREADS),
+        *("method", "network", "", "score", "less the default's in fp32"),
+        *("2 threads, ms", "1 thread, ms", "/ CJP's default, 2", "/ CJP's default, 1"),
         "on its method's front",
     ]
     return table(head, rows())
+
+
+def _difference(point: Point) -> str:
+    if point.lost is None or (point.default and point.precision == "fp32"):
+        return "-"
+    value, error = point.lost
+    return f"{value:+.3f} ± {error:.3f}" if error else f"{value:+.3f}"
 
 
 def backbones() -> str:
@@ -133,11 +142,15 @@ def backbones() -> str:
     found = read_result("pareto", "pareto")["backbones"]
 
     def cell(row: dict[str, Any], threads: str) -> list[str]:
-        return [f"{row[precision][threads]['raw']['median']:.2f}" for precision in PRECISIONS]
+        return [f"{row[precision][threads]['raw']['p10']:.2f}" for precision in PRECISIONS]
 
     head = ["network up to stride 16, 256x192"]
     head += [f"{p} on {t}, ms" for t in THREADS for p in PRECISIONS]
     return table(head, ([name, *cell(row, "2"), *cell(row, "1")] for name, row in found.items()))
 
 
-TABLES: dict[str, Callable[[], str]] = {"pareto": scores, "pareto backbones": backbones}
+TABLES: dict[str, Callable[[], str]] = {
+    "pareto flights": partial(scores, "flights"),
+    "pareto walk": partial(scores, "walk"),
+    "pareto backbones": backbones,
+}
