@@ -13,7 +13,6 @@ pose, and no more). ``step`` runs all checks and the alarm.
 from __future__ import annotations
 
 import sys
-from collections import Counter
 from collections.abc import Callable
 from itertools import cycle
 from pathlib import Path
@@ -86,7 +85,7 @@ class Timed:
 
     def __init__(self, bundle: Bundle, sink: Sink, scope: Scope = "marginal") -> None:
         self.conformal_ms: list[float] = []
-        self._unbounded: Counter[str] = Counter()
+        self.bounded: list[bool] = []
         self._spec = bundle.calibration.preprocess
         self._odometer = Odometer(bundle, threads=THREADS, scope=scope)
         self._alone = Session(pose_alone(bundle.model_bytes), THREADS)
@@ -132,12 +131,8 @@ class Timed:
         """Time one step, from image array to interval."""
         estimate = self._odometer.step(self._image)
         self.conformal_ms.append(estimate.latency_ms["conformal"])
-        self._unbounded.update(estimate.reasons * (not estimate.bounded))
-
-    def check(self, count: int) -> None:
-        """Refuse times of steps without intervals; networks that know little doubt a few frames."""
-        if 2 * self._unbounded.total() > count:
-            raise SystemExit(f"expected intervals, found {dict(self._unbounded)} in {count} frames")
+        # Networks that know little doubt some frames, which take as long but for the set.
+        self.bounded.append(estimate.bounded)
 
     def record(self, _: int) -> None:
         """From a JPEG file to a line in a file."""
@@ -164,6 +159,7 @@ def measured(folder: Path, rounds: int, scope: Scope = "marginal") -> dict[str, 
     """
     found: dict[tuple[str, str], list[tuple[Array, Array]]] = {pair: [] for pair in PAIRS}
     conformal_ms: list[float] = []
+    bounded: list[bool] = []
     with Sink(str(WORK / "records.jsonl"), "jsonl") as sink:
         for _ in range(BLOCKS):
             timed = Timed(read_bundle(folder), sink, scope)
@@ -173,7 +169,7 @@ def measured(folder: Path, rounds: int, scope: Scope = "marginal") -> dict[str, 
                 two = {name: calls[name] for name in (first, second)}
                 ms = interleaved(two, rounds=rounds // BLOCKS, warmup=WARM_UP, before=before)
                 found[first, second].append((ms[first], ms[second]))
-            timed.check(2 * (WARM_UP + rounds // BLOCKS))
+            bounded += timed.bounded
             conformal_ms += timed.conformal_ms[WARM_UP:]
     (record, raw_beside_record), (step_beside_alone, alone), (step, raw) = (
         np.concatenate(blocks, axis=1) for blocks in found.values()
@@ -192,6 +188,7 @@ def measured(folder: Path, rounds: int, scope: Scope = "marginal") -> dict[str, 
         "uncertainty_ms": figures(more_ms),
         "cost_of_uncertainty": figures(more_ms / alone),
         "after_network_ms": figures(np.array(conformal_ms)),
+        "bounded": float(np.mean(bounded)),
     }
 
 
@@ -215,7 +212,7 @@ def line(row: dict[str, Any]) -> str:
         f"{row['step_over_raw']['median']:.3f} (+{row['step_minus_raw_ms']['median']:.3f} ms), "
         f"record / raw {row['record_over_raw']['median']:.3f}, uncertainty "
         f"{row['cost_of_uncertainty']['median']:.3f}, after the network "
-        f"{row['after_network_ms']['median']:.3f} ms"
+        f"{row['after_network_ms']['median']:.3f} ms, {row['bounded']:.0%} with intervals"
     )
 
 
