@@ -292,7 +292,7 @@ class Odometer(Labelled):
         moving: bool | None = None,
         beside_others: bool = False,
     ) -> Processed:
-        """Process a frame; ``beside_others`` in threads, and as far as no other frame matters."""
+        """Process a frame; ``beside_others``: in a worker thread, without the stream checks."""
         frame = frame.told(moving)
         waited_ms = max(frame.read_ms, frame.since_arrival_ms(self._clock.now_s()))
         start = perf_counter()

@@ -33,6 +33,12 @@ def tells_of_the_place(observation: Observation) -> bool:
     return observation.fault is None and observation.doubt in (None, Reason.IMAGE_UNFAMILIAR)
 
 
+def _same_picture(look: Look | None, other: Look | None) -> bool:
+    if look is None or other is None:
+        return False
+    return look.size == other.size and np.array_equal(look.digest.hashes, other.digest.hashes)
+
+
 class StreamWatch:
     """Watches one stream; pass every frame once, in order, to ``picture`` and then to ``judge``.
 
@@ -56,14 +62,21 @@ class StreamWatch:
         self._sizes = observer.stream_sizes()
         self._camera = observer.camera_check()
         self._alarm = StreamAlarm(calibration.alarm, false_alarms(calibration))
+        # The last picture and its doubts until its frame is judged.
+        self._unjudged: tuple[Look | None, tuple[Reason, ...]] | None = None
 
     def picture(self, look: Look | None, frame: Frame) -> tuple[Reason, ...]:
         """Return what speaks against a frame's picture among those of the stream.
 
-        It needs nothing of the network, and takes a third of the time before inference.
+        It needs nothing of the network. A picture that is passed again because its inference failed
+        is the same one, not a repetition.
         """
         moving = checked_hint(frame.moving)
-        return self._sizes.doubts(look) + self._checks.picture(look, frame.fresh_noise, moving)
+        if self._unjudged is not None and _same_picture(self._unjudged[0], look):
+            return self._unjudged[1]
+        doubts = self._sizes.doubts(look) + self._checks.picture(look, frame.fresh_noise, moving)
+        self._unjudged = look, doubts
+        return doubts
 
     def judge(
         self,
@@ -77,7 +90,7 @@ class StreamWatch:
 
         ``picture``: what ``picture`` returned; ``age_ms``: the frame's age.
         """
-        self.image = frame.image
+        self.image, self._unjudged = frame.image, None
         own = observation.doubt, observation.fault
         doubts = tuple(reason for reason in own if reason is not None)
         doubts += picture + self._checks.times(frame.stamp_ns, age_ms)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from cvo_edge import Frame, Odometer, Reason, Status, open_source
 from cvo_edge.engine.loading import Bundle, read_bundle
+from cvo_edge.errors import ModelError
 from cvo_edge.input.frame_checks import Look, StreamChecks, image_doubt
 from cvo_edge.input.preprocess import model_input
 
@@ -83,6 +84,20 @@ def test_a_frozen_camera_is_noticed_with_its_first_repetition(bundle_dir, images
         found = [estimate.reasons for estimate in odometer.stream(stream)]
     repeated = (Reason.FRAME_REPEATED,)
     assert found == [(), (), repeated, repeated, (), ()]
+
+
+def test_an_image_whose_inference_failed_may_come_again(bundle_dir, images, monkeypatch):
+    def fail(_feeds):
+        raise ModelError("no memory")
+
+    with Odometer.load(bundle_dir) as odometer:
+        for image in images[:2]:
+            with monkeypatch.context() as patch:
+                patch.setattr(odometer.session, "run", fail)
+                with pytest.raises(ModelError):
+                    odometer.step(image)
+            assert Reason.FRAME_REPEATED not in odometer.step(image).reasons
+            assert Reason.FRAME_REPEATED in odometer.step(image).reasons
 
 
 @pytest.mark.parametrize("buffers", [2, 4, 9])
