@@ -10,7 +10,13 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from cvo_edge.documents import one_line, shown
-from cvo_edge.errors import BundleMismatchError, GateError, SourceError, UsageError
+from cvo_edge.errors import (
+    BundleMismatchError,
+    GateError,
+    SourceError,
+    UsageError,
+    printable,
+)
 from cvo_edge.files import read_regular_file
 from cvo_edge.programs.bench_report import TIMED
 
@@ -20,13 +26,20 @@ TOLERANCE = 0.15
 _TIMES = 2.0
 
 Positive = Annotated[float, Meta(gt=0.0)]
+NotNegative = Annotated[float, Meta(ge=0.0)]
 
 
 class Quantiles(Struct):
     """Those that are compared, ms."""
 
-    p50: float
-    p95: float
+    p50: NotNegative
+    p95: NotNegative
+
+
+class BareCall(Struct):
+    """Of the bare inference call, ms."""
+
+    p50: Positive
 
 
 class Latencies(Struct):
@@ -83,11 +96,11 @@ class Report(Struct, kw_only=True):
     provider: str
     environment: Machine
     ratio_to_raw: Median
-    raw_model_ms: Quantiles
+    raw_model_ms: BareCall
     latency_ms: Latencies
     throughput_fps: Positive
-    cpu_ms_per_frame: float
-    load_ms: float
+    cpu_ms_per_frame: NotNegative
+    load_ms: NotNegative
     memory_mib: Memory
     against_script: AgainstScript | UnsetType = UNSET
 
@@ -130,7 +143,7 @@ def read_report(path: Path) -> Report:
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise SourceError(
             f"{path}: expected a report of this version's bench --json, found another file: "
-            f"{one_line(str(error))}"
+            f"{one_line(str(error))}; measure again with bench --json"
         ) from None
     return report
 
@@ -172,7 +185,8 @@ def _differences(old: Report, new: Report) -> Iterator[str]:
     }
     for name, (before, now) in pairs.items():
         if before != now:
-            yield f"{name} {before}, now {now}"
+            # The earlier report is another's file.
+            yield printable(f"{name} {before}, now {now}")
 
 
 def _figures(report: Report) -> dict[str, tuple[float, float | None]]:
@@ -185,7 +199,7 @@ def _figures(report: Report) -> dict[str, tuple[float, float | None]]:
         for name in ("latency", "throughput"):
             turns: Turns = getattr(report.against_script, name)
             found[f"mode {name} over the script"] = turns.over_script.median, 1.0
-    found["CPU time over the bare call"] = report.cpu_ms_per_frame / max(raw_ms, 1e-9), 1.0
+    found["CPU time over the bare call"] = report.cpu_ms_per_frame / raw_ms, 1.0
     found["peak memory, MiB"] = report.memory_mib.peak_rss, 1.0
     found["bare call, ms"] = raw_ms, _TIMES
     found["total, ms"] = latency.total.p50, _TIMES

@@ -116,6 +116,12 @@ def test_what_makes_reports_incomparable_is_named(tmp_path, report, place):
         regressions.check(comparison)
 
 
+def test_a_difference_is_text_without_control_characters(tmp_path, report):
+    comparison = compared(tmp_path, report | {"bundle": "old\x1b[31m"}, report)
+    (difference,) = comparison.differences
+    assert difference.startswith(r"bundle old\x1b[31m ")
+
+
 def without(report, key):
     return {name: value for name, value in report.items() if name != key}
 
@@ -130,6 +136,8 @@ def without(report, key):
         # As earlier versions wrote it.
         lambda report: json.dumps(without(report, "bundle_digest")),
         lambda report: json.dumps(report | {"ratio_to_raw": {"median": 0.0}}),
+        lambda report: json.dumps(report | {"raw_model_ms": {"p50": 0.0}}),
+        lambda report: json.dumps(report | {"load_ms": -1.0}),
         lambda report: "9" * 400,
     ],
 )
