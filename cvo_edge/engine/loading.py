@@ -10,7 +10,8 @@ import numpy as np
 
 from cvo_edge.bundle.format import MODEL_FILE, Calibration, ModelSpec, TensorSpec
 from cvo_edge.bundle.reading import Check, check_model_file, read_calibration_file, read_model
-from cvo_edge.engine.model_cache import CachedModel, ModelCache, identity
+from cvo_edge.engine.model_cache import CachedModel, ModelCache
+from cvo_edge.engine.own_files import identity
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError
 from cvo_edge.given import given_path

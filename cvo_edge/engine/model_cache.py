@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import io
 import os
 import platform
 import re
@@ -23,7 +22,6 @@ import shutil
 import stat
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +29,7 @@ import msgspec
 from msgspec import Struct
 
 from cvo_edge.bundle.device_record import DeviceRecord
+from cvo_edge.engine.own_files import FileIdentity, content, file_digests, identity, not_ours
 from cvo_edge.errors import BundleMismatchError, SinkError
 from cvo_edge.files import OTHERS_WRITE, own_folder, untrusted, write_whole
 from cvo_edge.given import given_path
@@ -40,8 +39,6 @@ GRAPH_FILE, WEIGHTS_FILE, ENTRY_FILE = "graph.onnx", "weights.bin", "entry.json"
 SEEN_FILE = "seen.json"
 CACHE_VARIABLE = "CVO_EDGE_CACHE"
 
-# Fits into the private cache of a core.
-_CHUNK_BYTES = 1 << 20
 _UNFINISHED = ".unfinished-"
 _ENTRY_NAME = re.compile("[0-9a-f]{32}")
 # A build takes seconds; an unfinished folder older than this was interrupted.
@@ -67,16 +64,6 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True):
     processor: str
     graph_sha256: str
     weights_sha256: list[str]
-
-
-class FileIdentity(Struct, frozen=True, array_like=True):
-    """File metadata that reveals a change; ``ctime_ns`` advances with every change."""
-
-    device: int
-    inode: int
-    size: int
-    mtime_ns: int
-    ctime_ns: int
 
 
 @dataclass(frozen=True)
@@ -137,12 +124,12 @@ class ModelCache:
         folder = self._entry_folder(model_sha256, provider)
         try:
             if untrusted(folder.lstat()):
-                raise _not_ours(folder)
-            stated = _content(folder / ENTRY_FILE)
+                raise not_ours(folder)
+            stated = content(folder / ENTRY_FILE)
             if not self._is_sealed(model_sha256, stated):
                 return None
             entry = msgspec.json.decode(stated, type=Entry)
-            graph = _content(folder / GRAPH_FILE)
+            graph = content(folder / GRAPH_FILE)
             unchanged = (
                 (entry.model_sha256, entry.engine, entry.processor)
                 == (model_sha256, _engine(provider), _processor())
@@ -319,72 +306,16 @@ def _is_entry(folder: Path) -> bool:
 
 def _read_entry(folder: Path) -> Entry | None:
     try:
-        return msgspec.json.decode(_content(folder / ENTRY_FILE), type=Entry)
+        return msgspec.json.decode(content(folder / ENTRY_FILE), type=Entry)
     except (OSError, *_UNDECODABLE):
         return None
-
-
-def identity(path: Path) -> FileIdentity | None:
-    """Return the metadata of a regular file, or None if it is missing or not regular."""
-    try:
-        found = path.lstat()
-    except OSError:
-        return None
-    if not stat.S_ISREG(found.st_mode):
-        return None
-    return FileIdentity(
-        found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
-    )
 
 
 def _seen(cached: CachedModel) -> list[FileIdentity]:
     try:
-        return msgspec.json.decode(_content(cached.folder / SEEN_FILE), type=list[FileIdentity])
+        return msgspec.json.decode(content(cached.folder / SEEN_FILE), type=list[FileIdentity])
     except (OSError, *_UNDECODABLE):
         return []
-
-
-def _opened(path: Path) -> io.FileIO:
-    """Open a regular file that others cannot write to, without following links or waiting."""
-    stream = io.FileIO(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK))
-    found = os.fstat(stream.fileno())
-    if stat.S_ISREG(found.st_mode) and not untrusted(found):
-        return stream
-    stream.close()
-    if stat.S_ISREG(found.st_mode):
-        raise _not_ours(path)
-    raise FileNotFoundError(errno.ENOENT, "expected a regular file", str(path))
-
-
-def _not_ours(path: Path) -> PermissionError:
-    return PermissionError(errno.EPERM, "other users may write to it", str(path))
-
-
-def _content(path: Path) -> bytes:
-    with _opened(path) as stream:
-        return stream.read()
-
-
-def file_digests(path: Path) -> list[str]:
-    """Return the sha256 of each MiB of a file, using all cores in parallel; raises OSError."""
-    with _opened(path) as stream:
-        size = os.fstat(stream.fileno()).st_size
-        workers = os.cpu_count() or 1
-
-        def digests(first: int) -> dict[int, str]:
-            buffer = memoryview(bytearray(_CHUNK_BYTES))
-            return {
-                offset: hashlib.sha256(
-                    buffer[: os.preadv(stream.fileno(), [buffer], offset)]
-                ).hexdigest()
-                for offset in range(first * _CHUNK_BYTES, size, workers * _CHUNK_BYTES)
-            }
-
-        found: dict[int, str] = {}
-        with ThreadPoolExecutor(workers) as pool:
-            for part in pool.map(digests, range(workers)):
-                found |= part
-    return [found[offset] for offset in sorted(found)]
 
 
 def _engine(provider: Provider) -> str:

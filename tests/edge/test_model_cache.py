@@ -21,8 +21,8 @@ from cvo_edge.engine.model_cache import (
     WEIGHTS_FILE,
     CachedModel,
     ModelCache,
-    file_digests,
 )
+from cvo_edge.engine.own_files import file_digests
 from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.engine.session import Session
 from cvo_edge.errors import BundleMismatchError, ModelError, UsageError

@@ -22,8 +22,8 @@ from cvo_edge.engine.model_cache import (
     WEIGHTS_FILE,
     CachedModel,
     ModelCache,
-    file_digests,
 )
+from cvo_edge.engine.own_files import file_digests
 from cvo_edge.engine.selftest import check_selftest
 from cvo_edge.programs.verify import verify_bundle
 from cvo_export.bundles.writing import check_target, write_bundle
