@@ -112,11 +112,11 @@ def bench(
     allowed = regressions.checked_tolerance(
         regressions.TOLERANCE if tolerance is None else tolerance
     )
+    inputs = source, bundle, compare
     if json_file is not None:
-        check_output(json_file, source, bundle, compare, force=force)
+        check_output(json_file, *inputs, force=force)
     if report is not None:
-        page = bench_page.checked_page(report)
-        check_output(page, source, bundle, compare, json_file, force=force)
+        check_output(bench_page.checked_page(report), *inputs, json_file, force=force)
     files = script.check_read_again(source) if against_script else ""
     earlier = None if compare is None else regressions.read_report(compare)
     models = model_cache(cache)

@@ -40,7 +40,6 @@ def inspect_lines(calibration: Calibration) -> list[str]:
     details = f", {head.description()}" if head.description() else ""
     tensors = ", ".join(f"{t.name} {list(t.shape)}" for t in (*model.inputs, *model.outputs))
     dof, scale = Chart(pose.rotation).dof, calibration.difficulty
-    images = calibration.images
     lines = [
         *_entry("name", calibration.name),
         *_entry("method", f"{calibration.method}, {source.score} score{details}"),
@@ -61,11 +60,7 @@ def inspect_lines(calibration: Calibration) -> list[str]:
         ),
         *_crossed(source),
         *([] if calibration.camera is None else _entry("camera", _camera(calibration.camera))),
-        *(
-            []
-            if images is None
-            else _entry("images", _images(images, calibration.preprocess.decode))
-        ),
+        *_images(calibration.images, calibration.preprocess.decode),
         *_entry("alarm", alarm_statement(calibration)),
         *([] if scale is None else _entry("difficulty", _difficulty(scale))),
         *_entry("joint", f"by {head.joint_description(source.joint)}"),
@@ -122,10 +117,12 @@ def _position(position_m: Position) -> str:
     return " ".join(f"{value:.10g}" for value in position_m) + " m in the world"
 
 
-def _images(images: ImageSpec, decode: Decode) -> str:
+def _images(images: ImageSpec | None, decode: Decode) -> list[str]:
+    if images is None:
+        return []
     colour = "colour" if images.colour else "grey or mixed"
     half = "; JPEG files, decoded at half size" if decode == "half" else ""
-    return f"{images.width}x{images.height}, {colour}{half}"
+    return _entry("images", f"{images.width}x{images.height}, {colour}{half}")
 
 
 def _camera(camera: Camera) -> str:
