@@ -47,8 +47,7 @@ def decode_document(
             newer = type(found) is int and found > max(versions)
             remedy = "a newer file needs a newer cvo-edge" if newer else "make the file again"
             raise CalibrationFileError(
-                f"schema_version: expected {' or '.join(map(str, versions))}, found "
-                f"{shown(found)}; {remedy}"
+                f"schema_version: expected {_either(versions)}, found {shown(found)}; {remedy}"
             )
         _check_digest(content)
         decoded = msgspec.convert(document, kind, strict=True)
@@ -90,6 +89,12 @@ def encode_document(document: Struct, limit: int, name: str, *, dense: bool = Fa
     if len(content) > limit:
         raise CalibrationFileError(f"{name}: expected at most {limit} bytes, found {len(content)}")
     return content
+
+
+def _either(versions: Sequence[int]) -> str:
+    """Return numbers as text: ``1``, ``1 or 2``, ``1, 2 or 3``."""
+    *others, last = map(str, versions)
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def _parse_json(content: bytes) -> dict[str, Any]:

@@ -64,7 +64,8 @@ def replaced(document, path, value):
 
 
 REFUSED = [
-    (("schema_version",), 3, "schema_version: expected 1 or 2, found 3"),
+    (("schema_version",), 4, "schema_version: expected 1, 2 or 3, found 4"),
+    (("schema_version",), 3, "expected 1 for a bundle without quantiles, found 3"),
     (("schema_version",), "1", "schema_version"),
     (("schema_version",), True, "schema_version"),
     (("name",), ..., "missing required field `name`"),
