@@ -150,7 +150,7 @@ def _measured(
         "latency_ms": found.latency.summary(),
         "raw_model_ms": quantiles(found.raw_ms),
         "ratio_to_raw": {"median": round(float(np.median(found.ratios)), 4)},
-        "throughput_fps": round(counted / found.wall_s, 1),
+        "throughput_fps": round(counted / found.wall_s, 3),
         "load_ms": round(load_ms, 1),
         "first_interval_ms": first_interval_ms,
         "cpu_ms_per_frame": round(1e3 * found.cpu_s / counted, 3),

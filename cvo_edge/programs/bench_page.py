@@ -89,7 +89,7 @@ def _figures(report: Mapping[str, Any]) -> Iterator[str]:
     shown = {
         "total, median": f"{report['latency_ms']['total']['p50']:.2f} ms",
         f"{TIMED[report['mode']]} / bare call": f"{report['ratio_to_raw']['median']:.3f}",
-        "frames per second": f"{report['throughput_fps']:.0f}",
+        "frames per second": f"{report['throughput_fps']:.1f}",
         "processor time per frame": f"{report['cpu_ms_per_frame']:.2f} ms",
         "peak memory": f"{report['memory_mib']['peak_rss']:.0f} MiB",
         "process start to first interval": "unknown" if first is None else f"{first:.0f} ms",

@@ -27,7 +27,7 @@ def benchmark_lines(report: Mapping[str, Any]) -> list[str]:
         header,
         *(f"{k:<12}" + "".join(f"{v:>9.3f}" for v in row.values()) for k, row in rows.items()),
         f"{TIMED[report['mode']]} over the bare model call: {report['ratio_to_raw']['median']:.3f}",
-        f"{report['throughput_fps']:.0f} frames/s, {report['cpu_ms_per_frame']:.2f} CPU-ms "
+        f"{report['throughput_fps']:.1f} frames/s, {report['cpu_ms_per_frame']:.2f} CPU-ms "
         f"per frame, load {report['load_ms']:.0f} ms, first interval "
         f"{_number(report['first_interval_ms'])} ms after process start",
         *remarks(report),
