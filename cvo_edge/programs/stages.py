@@ -120,7 +120,7 @@ class Spans:
     def read(self, read: Callable[[], Frame]) -> Frame:
         """Read a frame in the stage ``read``; other sources than files may have read it before."""
         frame = self.timed(READ, read)()
-        spent = self.found[READ][-1]
+        spent = self._local.spent
         spent[READ,] = max(spent[READ,], 1e-3 * frame.read_ms)
         return frame
 
