@@ -45,6 +45,8 @@ class Cells:
     ----------
     rows
         Shape (10, 2, n): derivatives of the image by the pose, its error, derivatives by the lens.
+    squared
+        Shape (n,): squared errors at the last pose, and the last lens if one was given.
     """
 
     def __init__(

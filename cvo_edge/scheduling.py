@@ -70,11 +70,11 @@ def checked_mode(mode: str) -> Mode:
 
 
 def usual_mode(frames: Source, *, adapts: bool) -> Mode:
-    """Return the fastest mode for a source that loses nothing.
+    """Return the mode that is fastest for a source and drops no frame of a recording.
 
-    Several frames at once start before the labels of the first of them can count, and are given
-    when later ones have come: not for an odometer that adapts, nor for frames that are waited for.
-    A single frame has all cores for itself.
+    In ``throughput``, a frame starts before the labels of earlier ones can count, and its estimate
+    may wait for later frames to come: an odometer that adapts and a source without a known end get
+    ``latency``. So does a single frame, which then has all cores for itself.
     """
     if frames.live:
         return "live"
