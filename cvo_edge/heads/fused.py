@@ -185,7 +185,10 @@ def fuse(
 def _turned(
     x: float, y: float, z: float, w: float, a: float, b: float, c: float
 ) -> tuple[float, float, float, float]:
-    """Quaternion x y z w, then the rotation vector a b c, rad, about its axes -> quaternion."""
+    """Quaternion x y z w, then the rotation vector a b c, rad, about its axes -> quaternion.
+
+    For one quaternion, plain Python is faster than ``geometry``.
+    """
     angle = math.sqrt(a * a + b * b + c * c)
     factor, d = math.sin(0.5 * angle) / angle if angle > 0.0 else 0.5, math.cos(0.5 * angle)
     a, b, c = factor * a, factor * b, factor * c
