@@ -64,7 +64,7 @@ def test_disabled_checks_lead_to_findings(monkeypatch, artifacts_dir):
     assert len(bundles.models(4).findings) == len(bundles.calibrations(4).findings) == 4
     # Without frame checks, every faulted frame gets an interval.
     monkeypatch.setattr("cvo_edge.engine.observation.image_doubt", lambda _: None)
-    monkeypatch.setattr("cvo_edge.input.frame_checks.StreamChecks.doubts", lambda *_: ())
+    monkeypatch.setattr("cvo_edge.input.frame_checks.StreamChecks.picture", lambda *_: ())
     assert sensors.sensors(40).findings
     monkeypatch.setattr(simulation, "conformal_quantile", lambda scores, _: scores.max())
     assert simulation.coverage(10).findings

@@ -138,7 +138,8 @@ class Backbone(nn.Module):
                 continue
             rows = getattr(self, f"_rows{number}")
             columns = getattr(self, f"_columns{number}")
-            pooled.append(_means(feature_map, rows, columns).flatten(1))
+            # One product for all channels takes half the time of two for each of them.
+            pooled.append((feature_map.flatten(2) @ torch.kron(rows, columns.T).T).flatten(1))
         return torch.cat(pooled, dim=1)
 
     def cells(self, features: Tensor) -> Tensor:
@@ -163,11 +164,11 @@ class Pooled(nn.Module):
 
     def forward(self, deep: Tensor) -> Tensor:
         """Shape (n, channels, rows, columns) -> (n, size)."""
-        return _means(deep, self.rows, self.columns).flatten(1)
+        return (self.rows @ deep @ self.columns).flatten(1)
 
     def cells(self, deep: Tensor) -> Tensor:
         """Shape (n, channels, rows, columns) -> (n, cells, channels)."""
-        return _means(deep, self.rows, self.columns).transpose(1, 2)
+        return (self.rows @ deep @ self.columns).flatten(2).transpose(1, 2)
 
 
 def load_weights(backbone: Backbone, weights: str) -> str | None:
@@ -221,14 +222,6 @@ def _mean_std(body: nn.Module, normalisation: Normalisation) -> tuple[list[float
         return [0.5] * 3, [0.5] * 3
     config = cast("Mapping[str, Sequence[float]]", body.pretrained_cfg)
     return list(config["mean"]), list(config["std"])
-
-
-def _means(feature_map: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """Map (n, channels, r, c) and matrices (cells, r), (c, cells) -> means (n, channels, cells).
-
-    One product for all channels takes a fifth of the time of two for each of them.
-    """
-    return feature_map.flatten(2) @ torch.kron(rows, columns.T).T
 
 
 def averaging(size: int, cells: int) -> Tensor:
