@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ MODES = ("latency", "throughput")
 SCRIPT = "script"
 FORMATS = ("jpg", "bmp")
 CORES = (2, 1)
-WARM_UP = 1
+WARM_UP, REST_S = 1, 1.0
 # CJP stands for the goals; the others differ in what follows the network.
 ROUNDS = {"cjp": 15}
 OTHER_ROUNDS = 3
@@ -139,6 +140,9 @@ def measured(
         for number in range(WARM_UP + rounds):
             for name, worker, mode in in_turn(several, number):
                 turns[name].append(worker.turn(mode))
+                if name == SCRIPT:
+                    # Its threads go on spinning, which would slow down whoever comes next.
+                    sleep(REST_S)
     spent: dict[str, Array] = {name: np.array(row[WARM_UP:]).T for name, row in turns.items()}
     spent |= {name: spent[of] for name, of in usual.items()}
     script = spent[SCRIPT]
