@@ -97,6 +97,7 @@ def test_the_pose_maximises_the_likelihood(size, optimize):
         np.testing.assert_allclose(found.pose[:3] / size, truth[:3] + oracle.x[:3], atol=1e-9)
         expected = geometry.quaternion_multiply(truth[3:], turn)
         np.testing.assert_allclose(found.pose[3:], expected, atol=1e-9)
+        assert found.last_step < 1e-4
 
 
 def test_the_information_predicts_the_errors():
