@@ -23,6 +23,8 @@ from provenance import RESULTS, write_result
 
 from cvo_export.evaluate import table
 
+# That of all results.
+SIZE = "256x192"
 SPLITS = {"redkitchen": "random", "kitchen_flights": "sequence"}
 CVO_EXPORT = (sys.executable, "-c", "from cvo_export.cli import main; main()")
 
@@ -52,7 +54,7 @@ def main() -> None:
         run, bundle = arguments.work / name, arguments.work / f"{name}-bundle"
         report_file = arguments.work / f"{name}.json"
         how = ("--split", SPLITS[arguments.recording], "--seed", str(seed), "--weights", weights)
-        cache = ("--cache", arguments.work / "features")
+        cache = ("--size", SIZE, "--cache", arguments.work / "features")
         seconds = {
             "train": timed(
                 "train", arguments.method, dataset, run, *how, *cache, *arguments.options

@@ -6,7 +6,7 @@ python bench/pareto_picture.py    # draw docs/pictures/pareto.png
 from __future__ import annotations
 
 import matplotlib as mpl
-from pareto_tables import METHODS, THREADS, Point, front, knee, points
+from pareto_tables import DEFAULT_SIZES, THREADS, Point, front, knee, points
 from provenance import ROOT, read_result
 
 mpl.use("agg")
@@ -16,7 +16,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 PICTURE = ROOT / "docs" / "pictures" / "pareto.png"
 # A palette for colour-blind readers (Okabe and Ito 2008), as in the pictures of studies.
-COLOURS = dict(zip(METHODS, ("#0072B2", "#D55E00"), strict=True))
+COLOURS = dict(zip(DEFAULT_SIZES, ("#0072B2", "#D55E00"), strict=True))
 
 
 def draw() -> None:

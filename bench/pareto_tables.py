@@ -1,4 +1,4 @@
-"""Table and picture of ``results/pareto``: score against milliseconds.
+"""Tables and picture of ``results/pareto``: score against milliseconds.
 
 python bench/pareto_tables.py    # draw docs/pictures/pareto.png
 """
@@ -16,16 +16,17 @@ from provenance import read_result
 
 PRECISIONS = ("fp32", "int8")
 THREADS = ("2", "1")
-# The networks that ``train`` makes by default.
-DEFAULT = {"size": "256x192", "stages": "16", "kept": 100}
-METHODS = ("cjp", "scr")
+# The networks that ``train`` makes by default, and the size that others are compared with.
+DEFAULT = {"stages": "16", "kept": 100}
+DEFAULT_SIZES = {"cjp": "192x144", "scr": "256x192"}
+LARGEST = "256x192"
 
 
 class Point(NamedTuple):
     """A network in one precision; milliseconds (p10) of a frame by threads.
 
-    ``score`` is the mean over seeds; ``lost`` what it is more than the default's in float32, and
-    the standard error of that over the test recordings. Both are None without training.
+    ``score`` is the mean over seeds; ``lost`` what it is more than at the largest size in float32,
+    and the standard error of that over the test recordings. Both are None without training.
     """
 
     method: str
@@ -42,7 +43,9 @@ def points(found: dict[str, Any]) -> list[Point]:
     """Return all networks."""
     made = []
     for row in found["networks"].values():
-        wanted = {"method": row["method"], "data": row["data"], **DEFAULT}
+        method, data = row["method"], row["data"]
+        wanted = {"method": method, "data": data, "size": LARGEST, **DEFAULT}
+        default = {**wanted, "size": DEFAULT_SIZES[method]}
         reference = next(r for r in found["networks"].values() if wanted.items() <= r.items())
         for precision in PRECISIONS:
             one = row[precision]
@@ -52,14 +55,14 @@ def points(found: dict[str, Any]) -> list[Point]:
             scores = [seed["normalised_interval_score"] for seed, _ in pairs]
             made.append(
                 Point(
-                    row["method"],
-                    row["data"],
+                    method,
+                    data,
                     _label(row),
                     precision,
                     float(np.mean(scores)) if scores else None,
                     _mean_and_error(np.concatenate(lost)) if lost else None,
                     {t: one["threads"][t]["frame"]["p10"] for t in THREADS},
-                    wanted.items() <= row.items(),
+                    default.items() <= row.items(),
                 )
             )
     return made
@@ -101,10 +104,13 @@ def scores(data: str) -> str:
     """Return the table of the networks on one kind of data."""
     every = points(read_result("pareto", "pareto"))
     some = [point for point in every if point.data == data]
-    default = next(p for p in some if p.default and p.method == "cjp" and p.precision == "fp32")
+    largest = _label({"size": LARGEST, **DEFAULT})
+    reference = next(
+        p for p in some if (p.method, p.label, p.precision) == ("cjp", largest, "fp32")
+    )
     fronts = {
         (method, threads): front([p for p in some if p.method == method], threads)
-        for method in METHODS
+        for method in DEFAULT_SIZES
         for threads in THREADS
     }
 
@@ -118,22 +124,24 @@ def scores(data: str) -> str:
                 "-" if point.score is None else f"{point.score:.3f}",
                 _difference(point),
                 *(f"{point.frame[t]:.2f}" for t in THREADS),
-                *(f"{point.frame[t] / default.frame[t]:.2f}" for t in THREADS),
+                *(f"{point.frame[t] / reference.frame[t]:.2f}" for t in THREADS),
                 " and ".join(on) or "-",
             ]
 
     head = [
-        *("method", "network", "", "score", "less the default's in fp32"),
-        *("2 threads, ms", "1 thread, ms", "/ CJP's default, 2", "/ CJP's default, 1"),
+        *("method", "network", "", "score", f"less {LARGEST}'s in fp32"),
+        *("2 threads, ms", "1 thread, ms", f"/ CJP at {LARGEST}, 2", f"/ CJP at {LARGEST}, 1"),
         "on its method's front",
     ]
     return table(head, rows())
 
 
 def _difference(point: Point) -> str:
-    if point.lost is None or (point.default and point.precision == "fp32"):
-        return "-"
-    value, error = point.lost
+    return "-" if point.lost in (None, (0.0, 0.0)) else _text(point.lost)
+
+
+def _text(difference: tuple[float, float]) -> str:
+    value, error = difference
     return f"{value:+.3f} ± {error:.3f}" if error else f"{value:+.3f}"
 
 
@@ -149,8 +157,52 @@ def backbones() -> str:
     return table(head, ([name, *cell(row, "2"), *cell(row, "1")] for name, row in found.items()))
 
 
+def sizes() -> str:
+    """Return the table of ``bench/sizes.py``: sizes of the input, with the whole training."""
+    scores: dict[tuple[str, ...], list[float]] = {}
+    for row in read_result("pareto", "sizes")["results"]:
+        for precision in PRECISIONS:
+            key = row["method"], row["data"], row["size"], precision
+            scores.setdefault(key, []).append(row[precision]["normalised_interval_score"])
+
+    def rows() -> Iterator[list[str]]:
+        for (method, data, size, precision), values in scores.items():
+            largest = scores[method, data, LARGEST, "fp32"]
+            seeds = min(len(values), len(largest))
+            more = np.subtract(values[:seeds], largest[:seeds])
+            yield [
+                *(method, data, size, precision, f"{np.mean(values):.3f}"),
+                " ".join(f"{value:.3f}" for value in values),
+                "-" if values is largest else _text(_mean_and_error(more)),
+            ]
+
+    head = ["method", "data", "size", "", "score", "of each seed", f"less {LARGEST}'s in fp32"]
+    return table(head, rows())
+
+
+def wrong_frames() -> str:
+    """Return the table of ``bench/wrong_frames.py`` for bundles of several input sizes."""
+
+    def rows() -> Iterator[list[str]]:
+        for size in ("256x192", "192x144", "160x120"):
+            found = read_result("pareto", f"wrong-frames-{size}")
+            kinds = list(found["wrong"].values())
+            shares = [[kind[key] for kind in kinds] for key in ("wrong", "finite")]
+            yield [
+                size,
+                *(f"{np.mean(share):.3f}" for share in shares),
+                f"{found['summary']['all']['over_0.10']} of {len(kinds)}",
+                f"{found['harmless']['clean']['wrong']:.2f}",
+            ]
+
+    head = ["size", "finite and wrong", "finite", "kinds with more than .10 finite and wrong"]
+    return table([*head, "clean frames: wrong"], rows())
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "pareto sizes": sizes,
     "pareto flights": partial(scores, "flights"),
     "pareto walk": partial(scores, "walk"),
     "pareto backbones": backbones,
+    "pareto wrong frames": wrong_frames,
 }

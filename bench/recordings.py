@@ -29,6 +29,8 @@ from cvo_export.datasets import PoseDataset, open_dataset
 
 DATA = Path(os.environ.get("CVO_DATA", "data"))
 WEIGHTS = Path(os.environ.get("CVO_WEIGHTS", "weights")) / "mobilenetv2_100_imagenet.safetensors"
+# That of all results.
+SIZE = "256x192"
 UTM_M = (500_000.0, 5_000_000.0, 100.0)
 ROOM = "synthetic:room,flights=48,frames=40"
 
@@ -125,7 +127,7 @@ def main() -> None:
                     call(
                         "cvo-export", "train", method, text, run, "--weights", WEIGHTS, "--cache",
                         options.work / "cache" / case, "--copies", str(options.copies),
-                        "--steps", str(options.steps),
+                        "--steps", str(options.steps), "--size", SIZE,
                         *(("--split", "random") if case.endswith("-random") else ()),
                     ),
                     call("cvo-export", "publish", run, bundle),

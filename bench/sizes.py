@@ -1,9 +1,10 @@
-"""The size of the network's input: CJP with its default budget on real recordings.
+"""The size of the network's input: regression methods on real recordings.
 
-    python bench/sizes.py WORK [--sizes 256x192,160x120] [--json FILE]
+    python bench/sizes.py WORK [--only WORD ...] [--json FILE]
 
-Trains, publishes in both precisions (rule pooled) and evaluates each size, recording and seed that
-WORK lacks. ``bench/pareto.py`` searches among more networks with a small part of this budget.
+Trains, publishes in both precisions (rule pooled) and evaluates every cell that WORK lacks: flights
+and walk with the default budget, drone and car with a small one. ``bench/pareto.py`` searches among
+more networks with a small part of this budget.
 """
 
 from __future__ import annotations
@@ -13,58 +14,86 @@ import json
 import os
 import subprocess
 import sys
-from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from pareto import DATA, PRETRAINED
+import pareto
 from precision import PRECISIONS, figures
 from provenance import write_result
 
 from cvo_export.publish import publish
 from cvo_export.training.run import load_run
 
-SIZES, SEEDS = ("256x192", "192x144", "160x120"), (0, 1, 2)
+SCORE = "normalised_interval_score"
+SIZES = ("256x192", "192x144", "160x120")
+# Recordings, their split, and options of ``train`` for short ones.
+DATA = {name: (*which, "") for name, which in pareto.DATA.items()} | {
+    "drone": ("euroc:$CVO_DATA/euroc_mh05", "random", "--copies 6 --steps 4000"),
+    "car": ("kitti:$CVO_DATA/kitti_00", "random", "--copies 6 --steps 4000"),
+}
 
 
-def cell(work: Path, size: str, data: str, seed: int) -> dict[str, Any]:
+class Cell(NamedTuple):
+    """One network."""
+
+    method: str
+    data: str
+    size: str
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """File name."""
+        return f"{self.method}-{self.size}-{self.data}-{self.seed}"
+
+
+CELLS = (
+    *(Cell("cjp", "flights", size, seed) for size in SIZES for seed in range(3)),
+    *(Cell("cjp", data, size) for data in ("walk", "drone", "car") for size in SIZES),
+    *(Cell("cqr", "flights", size) for size in SIZES[:2]),
+)
+
+
+def measured(cell: Cell, work: Path) -> dict[str, Any]:
     """Return the figures of one network by precision, made if WORK lacks them."""
-    name = f"cjp-{size}-{data}-{seed}"
-    path = work / f"{name}.json"
+    path = work / f"{cell.name}.json"
     if path.exists():
         found: dict[str, Any] = json.loads(path.read_text("utf-8"))
         return found
-    dataset, split = (os.path.expandvars(word) for word in DATA[data])
-    run = work / "runs" / name
-    options = f"--split {split} --size {size} --seed {seed} --cache {work / 'features'}"
-    options += f" --weights {os.path.expandvars(PRETRAINED)}"
+    dataset, split, short = (os.path.expandvars(word) for word in DATA[cell.data])
+    run = work / "runs" / cell.name
+    options = f"--split {split} --size {cell.size} --seed {cell.seed} {short}"
+    options += f" --cache {work / 'features'} --weights {os.path.expandvars(pareto.PRETRAINED)}"
     main_of = "from cvo_export.cli import main; main()"
-    command = [sys.executable, "-c", main_of, "train", "cjp", dataset, str(run)]
+    command = [sys.executable, "-c", main_of, "train", cell.method, dataset, str(run)]
     subprocess.run([*command, *options.split()], check=True, stdout=subprocess.DEVNULL)
     found = {}
     for precision in PRECISIONS:
-        bundle = work / "bundles" / f"{name}-{precision}"
+        bundle = work / "bundles" / f"{cell.name}-{precision}"
         if not bundle.exists():
-            publish(load_run(run, dataset), bundle, name, rule="pooled", precision=precision)
+            publish(load_run(run, dataset), bundle, cell.name, rule="pooled", precision=precision)
         found[precision] = figures(bundle, dataset)
     path.write_text(json.dumps(found), "utf-8")
     return found
 
 
 def main() -> None:
-    """Print the scores; write them as JSON where asked."""
+    """Print the scores; write all that are there as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--sizes", default=",".join(SIZES))
+    parser.add_argument("--only", nargs="*", default=[], help="words of the networks' names")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     rows = []
-    for seed, data, size in product(SEEDS, DATA, arguments.sizes.split(",")):
-        found = cell(arguments.work, size, data, seed)
-        rows.append({"size": size, "data": data, "seed": seed, **found})
-        scores = ", ".join(f"{each} {found[each]['score']:.3f}" for each in PRECISIONS)
-        print(f"{size} {data} seed {seed}: score {scores}", flush=True)
+    for cell in CELLS:
+        wanted = all(word in cell.name for word in arguments.only)
+        if not wanted and not (arguments.work / f"{cell.name}.json").exists():
+            continue
+        found = measured(cell, arguments.work)
+        rows.append({**cell._asdict(), **found})
+        scores = ", ".join(f"{each} {found[each][SCORE]:.3f}" for each in PRECISIONS)
+        print(f"{cell.name}: {scores}", flush=True)
     if arguments.json:
         write_result(arguments.json, {"results": rows})
 

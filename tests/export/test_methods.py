@@ -31,6 +31,7 @@ from cvo_export.networks.heads.csp import (
 )
 from cvo_export.networks.heads.mcqr import McqrConfig
 from cvo_export.networks.heads.point import PointNetwork
+from cvo_export.networks.methods import TRAINABLE
 from cvo_export.plot import plot, track
 from cvo_export.publish import publish
 from cvo_export.training import loop as training
@@ -227,6 +228,19 @@ def test_an_option_of_another_method_is_refused():
     with pytest.raises(UsageError, match="noise: expected a method that trains a head on features"):
         configure(**options(method="scr", noise=0.5))
     assert configure(**options(copies=2, noise=0.0)) == configure(**options(copies=2))
+
+
+def test_the_input_has_the_size_of_the_method_unless_another_is_given():
+    sizes = {}
+    for method in TRAINABLE:
+        config = configure(**options(method=method, size=None))
+        sizes[config.width, config.height] = sizes.get((config.width, config.height), 0) + 1
+        # The cells of a stem are 16 pixels wide and high.
+        if TRAINABLE[method].cells:
+            assert config.width % 16 == config.height % 16 == 0
+    assert sizes == {(192, 144): len(TRAINABLE) - 2, (256, 192): 2}
+    config = configure(**options(method="scr", size="96x64"))
+    assert (config.width, config.height) == (96, 64)
 
 
 @pytest.mark.parametrize(

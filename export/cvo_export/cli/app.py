@@ -63,6 +63,13 @@ GridOption = Annotated[
         rich_help_panel=NETWORK,
     ),
 ]
+SizeOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Width x height of the model's input; default: 192x144, for scr and fused 256x192.",
+        rich_help_panel=NETWORK,
+    ),
+]
 CopiesOption = Annotated[
     int | None,
     typer.Option(

@@ -17,6 +17,7 @@ from cvo_export.cli.app import (
     CopiesOption,
     DatasetArgument,
     GridOption,
+    SizeOption,
     StagesOption,
     StepsOption,
     TrainingSplitOption,
@@ -48,6 +49,7 @@ def compare(
     weights: WeightsOption = "timm",
     stages: StagesOption = "16",
     grid: GridOption = "3x4",
+    size: SizeOption = None,
     steps: StepsOption = None,
     copies: CopiesOption = None,
     jobs: Annotated[
@@ -77,6 +79,7 @@ def compare(
         seeds=seeds,
         stages=stages,
         grid=grid,
+        size=size,
         copies=copies,
         steps=steps,
     )

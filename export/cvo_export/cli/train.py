@@ -20,6 +20,7 @@ from cvo_export.cli.app import (
     CopiesOption,
     DatasetArgument,
     GridOption,
+    SizeOption,
     StagesOption,
     StepsOption,
     TrainingSplitOption,
@@ -86,10 +87,7 @@ def _train(
             rich_help_panel=NETWORK,
         ),
     ] = None,
-    size: Annotated[
-        str,
-        typer.Option(help="Width x height of the model's input.", rich_help_panel=NETWORK),
-    ] = "256x192",
+    size: SizeOption = None,
     crop: Annotated[
         Crop,
         typer.Option(help="Part of the image that the model sees.", rich_help_panel=NETWORK),

@@ -81,7 +81,7 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
     seeds: Annotated[int, Meta(ge=1)] = 3
     noises: list[str] = []
     vary: dict[str, Annotated[list[Value], Meta(min_length=1)]] = {}
-    size: str = "256x192"
+    size: str | None = None
     stages: str = "16"
     grid: str = "3x4"
     copies: Annotated[int, Meta(ge=0)] | None = None

@@ -252,8 +252,8 @@ def _setting_of(place: Place) -> tuple[Any, ...]:
 
 def _setting(grid: Grid) -> tuple[str, ...]:
     """Return what two grids must share for their cells to differ only in the varied options."""
-    training = (grid.copies, grid.steps, grid.fine_tune)
-    return (grid.weights, grid.size, grid.stages, grid.grid, *map(str, training))
+    training = (grid.size, grid.copies, grid.steps, grid.fine_tune)
+    return (grid.weights, grid.stages, grid.grid, *map(str, training))
 
 
 def _by_default(place: Place, option: str) -> bool:

@@ -31,7 +31,7 @@ def configure(
     dataset: str,
     split: SplitKind | None,
     seed: int,
-    size: str,
+    size: str | None,
     crop: Crop,
     backbone: str,
     weights: str,
@@ -46,14 +46,13 @@ def configure(
     None stands for the default. Raises UsageError for a malformed value or an option that the
     method does not have; these checks run before the data set is opened.
     """
-    chosen = head_config(method, head)
-    width, height = _pair(size, "size", "WIDTHxHEIGHT")
+    chosen, defaults = head_config(method, head), TRAINABLE[method]
+    width, height = defaults.size if size is None else _pair(size, "size", "WIDTHxHEIGHT")
     if min(width, height) < 32 or max(width, height) > 4096:
         raise UsageError(f"size: expected 32 to 4096 pixels, found {size}")
     if normalisation is None:
         normalisation = "timm" if weights in (TIMM_WEIGHTS, NO_WEIGHTS) else "half"
     numbers: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    defaults = TRAINABLE[method]
     if not numbers.get("noise", 1.0):
         del numbers["noise"]
     if "noise" in numbers and defaults.cells:

@@ -264,15 +264,17 @@ class Method:
     """One method: its options, its training, and how to restore a trained head.
 
     ``restore`` rebuilds a head from its state dict, given the setting and options of its training.
-    ``cells``: whether the head reads the map of a stem and trains the stages after it. ``copies``,
-    ``steps`` and ``augment`` are the defaults of a run; with cells, large data sets get fewer
-    copies. ``turns``: whether it learns targets of nine numbers, for rotations of any size.
+    ``cells``: whether the head reads the map of a stem and trains the stages after it. ``size``
+    (width and height of the input), ``copies``, ``steps`` and ``augment`` are the defaults of a
+    run; with cells, large data sets get fewer copies. ``turns``: whether it learns targets of nine
+    numbers, for rotations of any size.
     """
 
     config: type[Struct]
     train: Callable[[Lessons, Any], ExportedHead]
     restore: Callable[[Setting, Any, Mapping[str, Tensor]], ExportedHead]
     cells: bool = False
+    size: tuple[int, int] = (192, 144)
     copies: int = 48
     steps: int = 10_000
     augment: AugmentConfig = field(default_factory=AugmentConfig)

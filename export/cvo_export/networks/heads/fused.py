@@ -140,6 +140,7 @@ METHOD = Method(
     _train,
     _restore,
     cells=True,
+    size=SCR.size,
     copies=SCR.copies,
     steps=SCR.steps,
     augment=SCR.augment,

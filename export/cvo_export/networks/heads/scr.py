@@ -442,6 +442,7 @@ METHOD = Method(
     trained_scr,
     restored_scr,
     cells=True,
+    size=(256, 192),
     copies=16,
     steps=4000,
     augment=AugmentConfig(rotation_deg=8.0, motion_blur=0.3, zoom=0.15),
