@@ -6,8 +6,9 @@
 This program makes each network of ``CANDIDATES`` that WORK lacks, exports it in float32 and in
 8 bits, and scores both graphs on the test frames: the interval score at 0.9 in deviations of the
 training poses, with thresholds of the cal frames of the same graph, as ``cvo-export evaluate`` has
-it, but without the alarm and the choices of ``publish``. Networks of one method had the same
-budget, a small part of the default one: scores can be compared within a method only.
+it, but without the alarm and the choices of ``publish``. SCR is published and evaluated, because
+the self-check decides which frames have an interval. Networks of one method had the same budget, a
+small part of the default one: scores can be compared within a method only.
 """
 
 from __future__ import annotations
@@ -26,21 +27,22 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from precision import figures
 from pruned import pruned_weights
 
 from cvo_edge.camera import cell_centres
 from cvo_edge.conformal import conformal_quantile, interval_score
 from cvo_edge.engine.session import Session
 from cvo_edge.heads.scr import ScrParameters
-from cvo_edge.pose import Chart
 from cvo_edge.pose_solver import PoseSolver
-from cvo_edge.vocabulary import SplitKind
+from cvo_edge.vocabulary import Precision, SplitKind
 from cvo_export.data.splits import make_split
 from cvo_export.datasets import open_dataset
 from cvo_export.graph.quantise import quantised
 from cvo_export.graph.to_onnx import export_onnx
 from cvo_export.networks.backbone import Backbone, load_weights
 from cvo_export.progress import show_progress
+from cvo_export.publish import publish
 from cvo_export.training.configure import configure
 from cvo_export.training.features import FeatureExtractor, ModelImages, cached_copies
 from cvo_export.training.loop import MAP_FILE, train
@@ -55,7 +57,7 @@ DATA: dict[str, tuple[str, SplitKind]] = {
     "walk": ("7scenes:$CVO_DATA/redkitchen", "random"),
 }
 PRETRAINED = "$CVO_WEIGHTS/mobilenetv2_100_imagenet.safetensors"
-PRECISIONS = ("fp32", "int8")
+PRECISIONS: tuple[Precision, ...] = ("fp32", "int8")
 # Those whose features are computed in one pass.
 STAGES = ("8", "16")
 # The equal budget of a method's networks. SCR's stages after the stem stay as they were pretrained.
@@ -179,7 +181,7 @@ def trained(candidate: Candidate, seed: int, work: Path) -> Run:
     return run
 
 
-def graphs(graph: PoseGraph, config: TrainConfig, images: ModelImages) -> dict[str, bytes]:
+def graphs(graph: PoseGraph, config: TrainConfig, images: ModelImages) -> dict[Precision, bytes]:
     """Return a network in both precisions; images give the ranges of its maps."""
     blank = torch.zeros((1, config.height, config.width, 3), dtype=torch.uint8)
     deployed = PoseGraph(graph.backbone, graph.head.deployed()).eval()
@@ -212,8 +214,7 @@ def score(run: Run, content: bytes) -> dict[str, Any]:
     for role in ("cal", "test"):
         images = images_of(run, run.split.roles[role])
         found = [session.run({"image": image[np.newaxis]}) for image in images.images]
-        read = of_points if run.config.method == "scr" else of_bounds
-        error[role], below[role], above[role] = read(run, images, found)
+        error[role], below[role], above[role] = of_bounds(run, images, found)
     scores = np.maximum(-error["cal"] / below["cal"], error["cal"] / above["cal"])
     q_hat = np.array([conformal_quantile(column, 0.9) for column in scores.T])
     lower, upper = -q_hat * below["test"], q_hat * above["test"]
@@ -224,6 +225,7 @@ def score(run: Run, content: bytes) -> dict[str, Any]:
         "normalised_interval_score": float(value.mean()),
         # For the standard error of differences.
         "of_recordings": [float(value[sequence == each].mean()) for each in np.unique(sequence)],
+        "without_interval": 0.0,
         "coverage": float((distance == 0.0).mean()),
         "median_m": float(np.median(np.linalg.norm(error["test"][:, :3], axis=1))),
         "bytes": len(content),
@@ -243,20 +245,22 @@ def of_bounds(
     return error, np.maximum(at - lower, floor), np.maximum(upper - at, floor)
 
 
-def of_points(
-    run: Run, images: ModelImages, found: Sequence[Outputs]
-) -> tuple[Array, Array, Array]:
-    """Errors of the solved poses, and their deviations twice, (n, 6) each."""
-    solver, focal_px = solver_of(run, images)
-    chart = Chart("tangent_predicted")
-    errors, deviations = [], []
-    for one, pose in zip(found, images.poses, strict=True):
-        scale = np.exp(one["log_scale_px"][0].astype(float)) / focal_px
-        solved = solver.solve(one["coordinates"][0].astype(float), scale)
-        at = chart.coordinates(solved.pose, solved.pose)
-        errors.append(chart.coordinates(pose, solved.pose) - at)
-        deviations.append(np.sqrt(np.diag(np.linalg.inv(solved.information))))
-    return np.array(errors), np.array(deviations), np.array(deviations)
+def published_score(run: Run, precision: Precision, bundle: Path) -> dict[str, Any]:
+    """Return the same of a bundle, made if it is missing; frames without an interval do not count.
+
+    Without ``of_recordings``, which ``evaluate`` does not report.
+    """
+    if not bundle.exists():
+        publish(run, bundle, bundle.name, rule="pooled", precision=precision)
+    found = figures(bundle, run.config.dataset)
+    frames = found["frames"]
+    return {
+        "normalised_interval_score": found["normalised_interval_score"],
+        "without_interval": 1.0 - frames["bounded"] / frames["total"],
+        "coverage": found["mean_coverage"],
+        "median_m": found["point_error"]["median_m"],
+        "bytes": found["model_bytes"],
+    }
 
 
 def solver_of(run: Run, images: ModelImages) -> tuple[PoseSolver, float]:
@@ -286,7 +290,11 @@ def train_all(work: Path, only: list[str], seeds: int) -> None:
             graph = work / "graphs" / f"{candidate.name}-{seed}-{precision}.onnx"
             graph.parent.mkdir(exist_ok=True)
             graph.write_bytes(content)
-            row[precision] = score(run, content)
+            row[precision] = (
+                published_score(run, precision, work / "bundles" / graph.stem)
+                if candidate.method == "scr"
+                else score(run, content)
+            )
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(row, indent=1) + "\n", "utf-8")
         scores = [round(row[each]["normalised_interval_score"], 4) for each in PRECISIONS]

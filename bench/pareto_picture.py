@@ -55,6 +55,8 @@ def _draw_method(panel: Axes, own: list[Point], threads: str, colour: str) -> No
     best = front(own, threads)
     label = f"{own[0].method.upper()}: Pareto front"
     panel.plot([p.frame[threads] for p in best], [p.score for p in best], color=colour, label=label)
+    if all(point.lost is None or not point.lost[1] for point in own):
+        return  # Without standard errors there is no knee.
     at = knee(own, threads)
     place = at.frame[threads], at.score
     panel.plot(*place, "o", color=colour, markerfacecolor="none", markersize=14)

@@ -1,6 +1,6 @@
-"""Tables and picture of ``results/pareto``: score against milliseconds.
+"""Tables of ``results/pareto``: score against milliseconds.
 
-python bench/pareto_tables.py    # draw docs/pictures/pareto.png
+``bench/tables.py`` writes them into the pages; ``bench/pareto_picture.py`` draws the picture.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from markdown_table import table
 from numpy.typing import NDArray
 from provenance import read_result
 
+SCORE = "normalised_interval_score"
 PRECISIONS = ("fp32", "int8")
 THREADS = ("2", "1")
 # The networks that ``train`` makes by default, and the size that others are compared with.
@@ -26,7 +27,8 @@ class Point(NamedTuple):
     """A network in one precision; milliseconds (p10) of a frame by threads.
 
     ``score`` is the mean over seeds; ``lost`` what it is more than at the largest size in float32,
-    and the standard error of that over the test recordings. Both are None without training.
+    and the standard error of that over the test recordings, 0 where their scores are not known;
+    ``without`` the share of test frames without an interval. All are None without training.
     """
 
     method: str
@@ -35,6 +37,7 @@ class Point(NamedTuple):
     precision: str
     score: float | None
     lost: tuple[float, float] | None
+    without: float | None
     frame: dict[str, float]
     default: bool
 
@@ -51,21 +54,31 @@ def points(found: dict[str, Any]) -> list[Point]:
             one = row[precision]
             # Seeds are splits: a difference is that of the same seed, hence the same recordings.
             pairs = list(zip(one["seeds"], reference["fp32"]["seeds"], strict=False))
-            lost = [np.subtract(a["of_recordings"], b["of_recordings"]) for a, b in pairs]
-            scores = [seed["normalised_interval_score"] for seed, _ in pairs]
+            lost = [np.subtract(_of_recordings(a), _of_recordings(b)) for a, b in pairs]
+            scores = [seed[SCORE] for seed, _ in pairs]
             made.append(
                 Point(
                     method,
                     data,
                     _label(row),
                     precision,
-                    float(np.mean(scores)) if scores else None,
+                    _mean(scores),
                     _mean_and_error(np.concatenate(lost)) if lost else None,
+                    _mean([seed["without_interval"] for seed, _ in pairs]),
                     {t: one["threads"][t]["frame"]["p10"] for t in THREADS},
                     default.items() <= row.items(),
                 )
             )
     return made
+
+
+def _of_recordings(seed: dict[str, Any]) -> list[float]:
+    """Return the scores of single recordings, or the one of all."""
+    return list(seed.get("of_recordings", [seed[SCORE]]))
+
+
+def _mean(values: list[float]) -> float | None:
+    return float(np.mean(values)) if values else None
 
 
 def _mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
@@ -123,6 +136,7 @@ def scores(data: str) -> str:
                 point.precision,
                 "-" if point.score is None else f"{point.score:.3f}",
                 _difference(point),
+                "-" if point.without is None else f"{point.without:.3f}",
                 *(f"{point.frame[t]:.2f}" for t in THREADS),
                 *(f"{point.frame[t] / reference.frame[t]:.2f}" for t in THREADS),
                 " and ".join(on) or "-",
@@ -130,6 +144,7 @@ def scores(data: str) -> str:
 
     head = [
         *("method", "network", "", "score", f"less {LARGEST}'s in fp32"),
+        "frames without an interval",
         *("2 threads, ms", "1 thread, ms", f"/ CJP at {LARGEST}, 2", f"/ CJP at {LARGEST}, 1"),
         "on its method's front",
     ]
@@ -163,7 +178,7 @@ def sizes() -> str:
     for row in read_result("pareto", "sizes")["results"]:
         for precision in PRECISIONS:
             key = row["method"], row["data"], row["size"], precision
-            scores.setdefault(key, []).append(row[precision]["normalised_interval_score"])
+            scores.setdefault(key, []).append(row[precision][SCORE])
 
     def rows() -> Iterator[list[str]]:
         for (method, data, size, precision), values in scores.items():
